@@ -1,0 +1,1 @@
+"""Components: everything that the master steps, behind one FMU-like contract (base.py)."""

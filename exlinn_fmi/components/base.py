@@ -1,0 +1,146 @@
+"""The component contract: what the co-simulation master knows of anything that is stepped in time.
+
+An external FMU, a Python plant, a learned model, a signal source and an NMPC controller all look like
+this, and like an FMU: variables addressed by index, values in numpy buffers, statuses returned.
+
+Life of a component:
+
+    enter_initialization(t0, t1, starts) → set/get … → exit_initialization() → [set, get, step]* → close()
+
+`get` after `set` gives outputs that are up to date with the inputs at the present communication point
+(direct feed-through, as FMI 2.0 §4.2.1); `step` carries the component from t to t + h with inputs held.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Causality = Literal["parameter", "input", "output", "local", "independent"]
+Variability = Literal["constant", "fixed", "tunable", "discrete", "continuous"]
+VariableType = Literal["Real", "Integer", "Boolean", "Enumeration"]
+
+Values = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+class Status(IntEnum):
+    """Outcome of a call, numbered as in FMI: everything from DISCARD on stops the run."""
+
+    OK = 0
+    WARNING = 1
+    DISCARD = 2
+    ERROR = 3
+    FATAL = 4
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One variable of a component.
+
+    Args:
+        name: FMI structured name, unique within the component.
+        causality: as in FMI.
+        variability: as in FMI.
+        unit: SI unit as text, None where the component states none, ``"1"`` for dimensionless.
+        type: how the values are meant; all travel as float64 (booleans 0/1, integers exact to 2⁵³).
+        start: start value, None where there is none.
+        description: one line.
+        depends_on: for an output, the inputs it depends on directly; None where the component does not say.
+    """
+
+    name: str
+    causality: Causality = "local"
+    variability: Variability = "continuous"
+    unit: str | None = None
+    type: VariableType = "Real"
+    start: float | None = None
+    description: str = ""
+    depends_on: tuple[str, ...] | None = ()
+
+
+class Component(ABC):
+    """Anything that the master can step.
+
+    Attributes:
+        name: name in the scenario.
+        variables: all variables; an index into this tuple addresses one.
+        message: what the component last said of a status other than OK.
+    """
+
+    name: str
+    variables: tuple[Variable, ...]
+    message: str = ""
+
+    @property
+    def sampled(self) -> bool:
+        """Whether outputs change at communication points only and hold in between (sources, controllers)."""
+        return False
+
+    @property
+    def can_save_state(self) -> bool:
+        """Whether `save_state` and `restore_state` work."""
+        return False
+
+    @abstractmethod
+    def enter_initialization(
+        self, start_time: float, stop_time: float, starts: Mapping[str, float]
+    ) -> Status:
+        """Prepare for a run from `start_time` to `stop_time` [s] with start values by variable name.
+
+        May be called again after a run: the component begins afresh.
+
+        Raises:
+            InputError: a name in `starts` is unknown or cannot be set.
+        """
+
+    @abstractmethod
+    def exit_initialization(self) -> Status:
+        """End initialisation: start values and initial inputs are in force."""
+
+    @abstractmethod
+    def set(self, indices: Indices, values: Values) -> Status:
+        """Set the variables at `indices` (k,) to `values` (k,)."""
+
+    @abstractmethod
+    def get(self, indices: Indices, values: Values) -> Status:
+        """Write the variables at `indices` (k,) into `values` (k,)."""
+
+    @abstractmethod
+    def step(self, t: float, h: float) -> Status:
+        """Advance from t to t + h [s] with the inputs held."""
+
+    def save_state(self) -> object:
+        """A copy of the whole state, to be given to `restore_state`."""
+        raise NotImplementedError(f"{self.name} cannot save its state; ask can_save_state first")
+
+    def restore_state(self, state: object) -> None:
+        """Go back to a state that `save_state` returned."""
+        raise NotImplementedError(f"{self.name} cannot restore its state; ask can_save_state first")
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free everything the component holds; harmless when called twice."""
+
+    def index(self, name: str) -> int:
+        """Index of the variable of that name.
+
+        Raises:
+            KeyError: there is none.
+        """
+        for k, variable in enumerate(self.variables):
+            if variable.name == name:
+                return k
+        raise KeyError(name)
+
+    def indices(self, *causalities: Causality) -> Indices:
+        """Indices of all variables of these causalities."""
+        return np.array(
+            [k for k, v in enumerate(self.variables) if v.causality in causalities], dtype=np.intp
+        )

@@ -1,0 +1,1 @@
+"""Nonlinear model predictive control around a Lagrangian system: reference, OCP, solvers, controller."""

@@ -1,0 +1,1 @@
+"""The co-simulation master: graph, algorithms, recorder. It knows components.base and nothing else."""

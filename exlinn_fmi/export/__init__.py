@@ -1,0 +1,1 @@
+"""FMUs without Python inside, made from any plant or learned model."""
