@@ -1,0 +1,260 @@
+"""Results on disk: every file appears whole or not at all, and tables read back to the last bit.
+
+A table is three files: ``stem.csv`` (for people and other tools), ``stem.parquet`` (fast, units inside) and
+``stem.meta.json`` (units beside the CSV). The CSV has one header line, plain numbers in the shortest form
+that reads back as the same float64, booleans as 0/1, ``nan``/``inf`` where a value is not finite, no blanks
+and no comment lines; names that hold a comma are quoted. FMPy, OMSimulator and pandas read it.
+"""
+
+from __future__ import annotations
+
+import csv
+import errno
+import io
+import json
+import math
+import os
+import secrets
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from exlinn_fmi.errors import DataError, StorageError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+UNIT = b"unit"
+"""Key of the unit in the metadata of a Parquet field."""
+
+
+@contextmanager
+def whole(*paths: Path) -> Iterator[list[Path]]:
+    """Paths to write to instead of `paths`; the files come into place together when the block ends well.
+
+    The stand-ins lie in the same folder and keep the suffix. If the block fails they are removed and what was
+    there before stays. Missing folders are made.
+
+    Args:
+        paths: the files to write.
+
+    Raises:
+        StorageError: the disk is full, a folder is read-only, …: names the file and the cause.
+    """
+    token = secrets.token_hex(4)
+    stand_ins = [path.with_name(f".{token}.{path.name}") for path in paths]
+    try:
+        for path in paths:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        yield stand_ins
+        for stand_in in stand_ins:
+            _flush(stand_in)
+        for path, stand_in in zip(paths, stand_ins, strict=True):
+            stand_in.replace(path)
+    except OSError as error:
+        raise StorageError(_explain(_concerned(error, paths, stand_ins), error)) from error
+    finally:
+        for stand_in in stand_ins:
+            _discard(stand_in)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file.
+
+    Raises:
+        StorageError: it could not be written.
+    """
+    with whole(path) as (stand_in,):
+        stand_in.write_bytes(content)
+
+
+def write_text(path: Path, text: str) -> None:
+    r"""Write a text file in UTF-8 with \n at line ends.
+
+    Raises:
+        StorageError: it could not be written.
+    """
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write a JSON file; numbers that are not finite become null, numpy values plain ones.
+
+    Raises:
+        StorageError: it could not be written.
+    """
+    text = json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False)
+    write_text(path, text + "\n")
+
+
+def write_table(stem: Path, frame: pd.DataFrame, units: Mapping[str, str]) -> None:
+    """Write ``stem.csv``, ``stem.parquet`` and ``stem.meta.json``; the index of the frame is left out.
+
+    Args:
+        stem: path without suffix.
+        frame: columns of numbers, booleans or text; names are unique.
+        units: unit by column name; columns without one may be left out.
+
+    Raises:
+        StorageError: one of the files could not be written; none is replaced then.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    columns = {str(name): _column(frame[name]) for name in frame.columns}
+    fields = [
+        pa.field(name, column.type, metadata={UNIT: units[name].encode()} if name in units else None)
+        for name, column in columns.items()
+    ]
+    table = pa.table(list(columns.values()), schema=pa.schema(fields))
+    with whole(*(_beside(stem, suffix) for suffix in (".csv", ".parquet", ".meta.json"))) as files:
+        _write_csv(files[0], table)
+        pq.write_table(table, files[1], compression="zstd")
+        known = {name: units[name] for name in columns if name in units}
+        files[2].write_text(json.dumps({"units": known}, indent=2, ensure_ascii=False) + "\n", "utf-8")
+
+
+def read_table(stem: Path) -> tuple[pd.DataFrame, dict[str, str]]:
+    """Read what `write_table` wrote: the Parquet file if there is one, else the CSV file.
+
+    Args:
+        stem: path without suffix.
+
+    Returns:
+        The frame, and units by column name.
+
+    Raises:
+        DataError: there is no such table or it cannot be read.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    file = next((f for f in (_beside(stem, ".parquet"), _beside(stem, ".csv")) if f.is_file()), None)
+    if file is None:
+        raise DataError(
+            f"{stem}: found neither {stem.name}.parquet nor {stem.name}.csv; "
+            "give the path of a table without suffix"
+        )
+    try:
+        table = pq.read_table(file) if file.suffix == ".parquet" else _read_csv(file)
+        units = {f.name: f.metadata[UNIT].decode() for f in table.schema if UNIT in (f.metadata or {})}
+        meta = _beside(stem, ".meta.json")
+        if not units and meta.is_file():
+            units = json.loads(meta.read_text("utf-8"))["units"]
+    except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
+        raise DataError(
+            f"{file}: cannot be read as a table ({_one_line(error)}); make it again or remove it"
+        ) from error
+    return table.to_pandas(), units
+
+
+# ── tables ───────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _beside(stem: Path, suffix: str) -> Path:
+    """Path of a table's file; a dot in the stem's name is no suffix."""
+    return stem.with_name(stem.name + suffix)
+
+
+def _column(series: pd.Series[Any]) -> pa.Array:
+    """A pandas column as an Arrow one: NaN stays a number (it is no blank), missing text is empty."""
+    import pyarrow as pa
+
+    values = series.to_numpy()
+    if values.dtype.kind in "bifu":
+        return pa.array(values, from_pandas=False)
+    return pa.array(["" if v is None or v != v else str(v) for v in values], pa.string())
+
+
+def _write_csv(file: Path, table: pa.Table) -> None:
+    """Write a table in the form that the head of this module describes."""
+    import pyarrow as pa
+    import pyarrow.csv
+
+    for k, column in enumerate(table.columns):
+        if pa.types.is_boolean(column.type):
+            table = table.set_column(k, table.field(k).name, column.cast(pa.uint8()))
+    header = io.StringIO()
+    csv.writer(header, lineterminator="\n").writerow(table.column_names)
+    with file.open("wb") as stream:
+        stream.write(header.getvalue().encode("utf-8"))
+        pyarrow.csv.write_csv(table, stream, pyarrow.csv.WriteOptions(include_header=False))
+
+
+def _read_csv(file: Path) -> pa.Table:
+    """Read a CSV file; ``nan`` is a number, only an empty cell is none."""
+    import pyarrow.csv
+
+    options = pyarrow.csv.ConvertOptions(null_values=[""], strings_can_be_null=False)
+    return pyarrow.csv.read_csv(file, convert_options=options)
+
+
+# ── JSON ─────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _plain(value: object) -> object:
+    """`value` in JSON's own types."""
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+# ── storage ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _flush(file: Path) -> None:
+    """Have the system write a file out, which is when a full or broken disk is noticed at the latest."""
+    with file.open("rb+") as stream:
+        try:
+            os.fsync(stream.fileno())
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(file)) from error
+
+
+def _discard(stand_in: Path) -> None:
+    """Remove a stand-in if it is still there, whatever state the disk is in."""
+    try:
+        stand_in.unlink(missing_ok=True)
+    except OSError:
+        return
+
+
+def _concerned(error: OSError, paths: tuple[Path, ...], stand_ins: list[Path]) -> Path:
+    """The file that was meant: the one that the error names, else the last one that was begun."""
+    pairs = list(zip(paths, stand_ins, strict=True))
+    named = [path for path, stand_in in pairs if error.filename == str(stand_in)]
+    begun = [path for path, stand_in in pairs if stand_in.exists()]
+    return (named or begun or list(paths[:1]))[-1]
+
+
+def _explain(path: Path, error: OSError) -> str:
+    """What could not be written, why, and what to do."""
+    advice = {
+        errno.ENOSPC: "free some space there",
+        errno.EDQUOT: "free some space there",
+        errno.EACCES: "check the permissions and close programs that hold the file open",
+        errno.EPERM: "check the permissions and close programs that hold the file open",
+        errno.EROFS: "make the disk writable",
+        errno.ENOTDIR: "remove the file that stands where a folder should be",
+        errno.EEXIST: "remove the file that stands where a folder should be",
+        errno.EISDIR: "remove the folder of that name",
+    }.get(error.errno or 0, "check the disk")
+    cause = error.strerror or _one_line(error)
+    return f"{path}: could not be written ({cause}); {advice}, or choose another folder"
+
+
+def _one_line(error: Exception) -> str:
+    """An error's text on one line."""
+    return " ".join(str(error).split())
