@@ -91,13 +91,28 @@ def write_json(path: Path, content: object) -> None:
     write_text(path, text + "\n")
 
 
-def write_table(stem: Path, frame: pd.DataFrame, units: Mapping[str, str]) -> None:
+def read_json(path: Path) -> Any:
+    """Read a JSON file that a run wrote.
+
+    Raises:
+        DataError: it is not there or is no JSON.
+    """
+    try:
+        return json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read ({_one_line(error)}); make it again or remove it") from error
+
+
+def write_table(stem: Path, frame: pd.DataFrame, units: Mapping[str, str]) -> list[Path]:
     """Write ``stem.csv``, ``stem.parquet`` and ``stem.meta.json``; the index of the frame is left out.
 
     Args:
         stem: path without suffix.
         frame: columns of numbers, booleans or text; names are unique.
         units: unit by column name; columns without one may be left out.
+
+    Returns:
+        The paths of the three files.
 
     Raises:
         StorageError: one of the files could not be written; none is replaced then.
@@ -111,11 +126,13 @@ def write_table(stem: Path, frame: pd.DataFrame, units: Mapping[str, str]) -> No
         for name, column in columns.items()
     ]
     table = pa.table(list(columns.values()), schema=pa.schema(fields))
-    with whole(*(_beside(stem, suffix) for suffix in (".csv", ".parquet", ".meta.json"))) as files:
+    paths = [_beside(stem, suffix) for suffix in (".csv", ".parquet", ".meta.json")]
+    with whole(*paths) as files:
         _write_csv(files[0], table)
         pq.write_table(table, files[1], compression="zstd")
         known = {name: units[name] for name in columns if name in units}
         files[2].write_text(json.dumps({"units": known}, indent=2, ensure_ascii=False) + "\n", "utf-8")
+    return paths
 
 
 def read_table(stem: Path) -> tuple[pd.DataFrame, dict[str, str]]:

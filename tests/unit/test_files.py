@@ -252,3 +252,10 @@ def test_full_disk_keeps_the_old_table_whole(tiny_disk: Path):
     with pytest.raises(StorageError, match=r"t\.csv: could not be written \(No space left on device\); free"):
         files.write_table(tiny_disk / "t", frame_of([1 / 3] * 100_000), {})
     assert {f.name: f.read_bytes() for f in tiny_disk.iterdir()} == before
+
+
+def test_json_that_is_missing_or_broken_is_a_data_error(tmp_path: Path) -> None:
+    (tmp_path / "broken.json").write_text("{")
+    for name in ("broken.json", "missing.json"):
+        with pytest.raises(DataError, match=name):
+            files.read_json(tmp_path / name)
