@@ -53,6 +53,8 @@ class Variable:
         start: start value, None where there is none.
         description: one line.
         depends_on: for an output, the inputs it depends on directly; None where the component does not say.
+        min: least value that makes sense, None where the component states none.
+        max: greatest value that makes sense, None where the component states none.
     """
 
     name: str
@@ -63,6 +65,8 @@ class Variable:
     start: float | None = None
     description: str = ""
     depends_on: tuple[str, ...] | None = ()
+    min: float | None = None
+    max: float | None = None
 
 
 class Component(ABC):

@@ -19,11 +19,22 @@ class Spec(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
+def form(value: Any) -> str:
+    """What a value is, in the words of error texts; tells apart the forms that a setting may be written in."""
+    if isinstance(value, bool):
+        return "true or false"
+    names = {int: "a number", float: "a number", str: "text", list: "a list", tuple: "a list", dict: "a mapping"}
+    return next((name for kind, name in names.items() if isinstance(value, kind)), "nothing")
+
+
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Band = Annotated[tuple[Positive, Positive], Field(strict=False)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 VariablePath = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*\..+$", examples=["plant.alpha"])]
+StartValue = Annotated[
+    Annotated[float, Tag("a number")] | Annotated[bool, Tag("true or false")], Discriminator(form)
+]
 
 # ── signals ──────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -162,12 +173,20 @@ class Reference(Spec):
     )
 
 
+Weight = Annotated[
+    Annotated[NonNegative, Tag("a number")] | Annotated[dict[str, NonNegative], Tag("a mapping")],
+    Discriminator(form),
+]
+
+
 class Weights(Spec):
     """Weights of the cost: a number for all, or one by name (those not named weigh 0)."""
 
-    states: float | dict[str, NonNegative] = Field(10.0, description="Q, on x_ref − x")
-    inputs: float | dict[str, NonNegative] = Field(1e-3, description="R, on u, or on u − u_ref for tracking")
-    terminal: Literal["dare"] | NonNegative = Field(
+    states: Weight = Field(10.0, description="Q, on x_ref − x")
+    inputs: Weight = Field(1e-3, description="R, on u, or on u − u_ref for tracking")
+    terminal: Annotated[
+        Annotated[Literal["dare"], Tag("text")] | Annotated[NonNegative, Tag("a number")], Discriminator(form)
+    ] = Field(
         "dare", description="terminal cost: the Riccati solution at the reference, or a multiple of Q"
     )
 
@@ -213,7 +232,7 @@ class ComponentBase(Spec):
     step: Positive | None = Field(
         None, description="own communication step [s]: a multiple of the scenario's; that one if not given"
     )
-    start: dict[str, float | bool] = Field(
+    start: dict[str, StartValue] = Field(
         default_factory=dict, description="start values of parameters, inputs and states, by variable name"
     )
 
@@ -333,7 +352,7 @@ class Experiment(Spec):
     duration: Positive = Field(description="duration [s]")
     step: Positive = Field(1e-3, description="sampling step [s]")
     inputs: dict[VariablePath, Signal] = Field(description="signal for each driven plant input")
-    start: dict[str, float | bool] = Field(
+    start: dict[str, StartValue] = Field(
         default_factory=dict, description="start values of plant variables"
     )
 
@@ -426,6 +445,11 @@ class Metrics(Spec):
     )
 
 
+Targets = Annotated[
+    Annotated[VariablePath, Tag("text")] | Annotated[list[VariablePath], Tag("a list")], Discriminator(form)
+]
+
+
 class Scenario(Spec):
     """One experiment: components, how they are connected, and what is done with them."""
 
@@ -435,7 +459,7 @@ class Scenario(Spec):
     description: str = Field("", description="what it shows")
     seed: int = Field(0, ge=0, description="seed of everything random")
     components: dict[Name, ComponentSpec] = Field(min_length=1, description="what takes part, by name")
-    connections: dict[VariablePath, VariablePath | list[VariablePath]] = Field(
+    connections: dict[VariablePath, Targets] = Field(
         default_factory=dict, description="from: to, or from: [to, to], each component.variable"
     )
     learn: Learn | None = Field(None, description="learn a model of one component")
