@@ -18,7 +18,8 @@ Anything else that reaches the command line is a bug of ours: exit 3.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 
@@ -115,3 +116,21 @@ class StorageError(RunError):
 
 class Interrupted(RunError):
     """The user stopped the run; what was finished until then is on disk."""
+
+
+def nearest(name: str, known: Iterable[str], kind: str = "names") -> str:
+    """A hint for an unknown name: what the user may have meant, or what there is.
+
+    Args:
+        name: the unknown name.
+        known: all valid names.
+        kind: what they are, in the plural.
+    """
+    names = list(dict.fromkeys(known))
+    close = difflib.get_close_matches(name, names, n=3)
+    if close:
+        return f"did you mean {' or '.join(repr(c) for c in close)}?"
+    if not names:
+        return f"there are no {kind}"
+    shown = ", ".join(names[:8]) + (f", … ({len(names)} in all)" if len(names) > 8 else "")
+    return f"the {kind} are: {shown}"

@@ -9,7 +9,8 @@ paper's (11a) misprints ∂𝓛/∂q as ∂𝓛/∂q̇; forward model (16); inve
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -29,6 +30,21 @@ from exlinn_fmi.mechanics.coordinates import (
 
 Symbol = Any
 """A CasADi expression; CasADi ships no type information."""
+
+MAX_INTERNAL_STEP = 1e-3
+"""Longest integrator step [s] inside a communication step, in this process and in exported FMUs alike."""
+
+
+def internal_steps(h: float, max_step: float = MAX_INTERNAL_STEP) -> int:
+    """Number of equal integrator steps in a communication step.
+
+    A billionth is forgiven, so that 10 ms are ten steps of 1 ms whatever the rounding.
+
+    Args:
+        h: communication step [s].
+        max_step: longest integrator step [s].
+    """
+    return max(1, math.ceil(h / max_step - 1e-9))
 
 
 @dataclass(frozen=True)
@@ -190,6 +206,15 @@ class LagrangianSystem:
             x = x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         return ca.Function("rk4", [x0, u, p, h], [x], ["x", "u", "p", "h"], ["xn"])
 
+    @cached_property
+    def output(self) -> ca.Function:
+        """(x, u, p) → y = (x, accelerations, stored energy), as a plant's outputs begin."""
+        _, _, _, u, p = self._symbols
+        x = ca.SX.sym("x", len(self.state_names))
+        q, v = self.split_state(x)
+        y = ca.densify(ca.vertcat(x, self.forward(q, v, u, p), self.energy(q, v, p)))
+        return ca.Function("output", [x, u, p], [y], ["x", "u", "p"], ["y"])
+
     # ── energy ───────────────────────────────────────────────────────────────────────────────────────────
 
     @cached_property
@@ -256,3 +281,44 @@ def evaluate(function: ca.Function, *arguments: ArrayLike) -> NDArray[np.float64
     if columns == 1:
         return values.T
     return values.reshape(rows, batch, columns).transpose(1, 0, 2)
+
+
+def bind(
+    function: ca.Function, arguments: Sequence[NDArray[np.float64]], results: Sequence[NDArray[np.float64]]
+) -> Callable[[], None]:
+    """Tie a CasADi function to arrays: each call of what is returned reads and writes them in place.
+
+    About a microsecond a call where a call by value costs a hundred.
+
+    Args:
+        function: with dense arguments and results.
+        arguments: one contiguous array per argument, kept by the caller.
+        results: one contiguous array per result (matrices column by column), kept by the caller.
+    """
+    buffer: Any
+    buffer, evaluate_buffer = function.buffer()
+    for k, array in enumerate(arguments):
+        if array.size:
+            buffer.set_arg(k, array.data)
+    for k, array in enumerate(results):
+        if array.size:
+            buffer.set_res(k, array.data)
+
+    def call(_keep: object = (buffer, arguments, results)) -> None:
+        evaluate_buffer()
+
+    return call
+
+
+def feed_through(function: ca.Function, argument: int = 1) -> list[tuple[int, ...]]:
+    """For each row of a function's first result, the entries of one argument that it depends on.
+
+    Args:
+        function: e.g. ``system.output``.
+        argument: number of the argument, e.g. 1 for the inputs of (x, u, p).
+    """
+    depends: list[list[int]] = [[] for _ in range(function.size1_out(0))]
+    rows, columns = function.jac_sparsity(0, argument).get_triplet()
+    for row, column in zip(rows, columns, strict=True):
+        depends[row].append(column)
+    return [tuple(sorted(d)) for d in depends]
