@@ -161,7 +161,7 @@ def read_table(stem: Path) -> tuple[pd.DataFrame, dict[str, str]]:
         units = {f.name: f.metadata[UNIT].decode() for f in table.schema if UNIT in (f.metadata or {})}
         meta = _beside(stem, ".meta.json")
         if not units and meta.is_file():
-            units = json.loads(meta.read_text("utf-8"))["units"]
+            units = read_json(meta)["units"]
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
         raise DataError(
             f"{file}: cannot be read as a table ({_one_line(error)}); make it again or remove it"

@@ -59,6 +59,11 @@ def test_csv_has_plain_header_numbers_and_booleans(tmp_path: Path):
     assert (tmp_path / "t.csv").read_text() == 'time,"plant.A[1,2]",plant.on\n0,0.1,1\n0.001,-2,0\n'
 
 
+def test_write_table_tells_which_files_it_wrote(tmp_path: Path):
+    written = files.write_table(tmp_path / "t", frame_of([1.0]), {})
+    assert sorted(written) == sorted(tmp_path.iterdir())
+
+
 def test_pandas_reads_the_csv_exactly(tmp_path: Path):
     files.write_table(tmp_path / "t", frame_of(AWKWARD), {})
     back = pd.read_csv(tmp_path / "t.csv")
@@ -151,6 +156,19 @@ def test_json_holds_null_for_what_is_not_finite_and_plain_numbers_for_numpy(tmp_
     }
     assert "ü" in text
     assert text.endswith("}\n")
+
+
+def test_json_reads_back(tmp_path: Path):
+    files.write_json(tmp_path / "m.json", {"a": 0.1, "b": "ü"})
+    assert files.read_json(tmp_path / "m.json") == {"a": 0.1, "b": "ü"}
+
+
+@pytest.mark.parametrize("content", [None, b"{", b"\xff"])
+def test_missing_or_damaged_json_is_a_data_error(tmp_path: Path, content: bytes | None):
+    if content is not None:
+        (tmp_path / "m.json").write_bytes(content)
+    with pytest.raises(DataError, match=r"m\.json: cannot be read as JSON \(.*\); make it again"):
+        files.read_json(tmp_path / "m.json")
 
 
 def test_text_keeps_its_line_ends_and_folders_are_made(tmp_path: Path):
