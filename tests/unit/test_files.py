@@ -167,7 +167,7 @@ def test_json_reads_back(tmp_path: Path):
 def test_missing_or_damaged_json_is_a_data_error(tmp_path: Path, content: bytes | None):
     if content is not None:
         (tmp_path / "m.json").write_bytes(content)
-    with pytest.raises(DataError, match=r"m\.json: cannot be read as JSON \(.*\); make it again"):
+    with pytest.raises(DataError, match=r"m\.json: cannot be read \(.*\); make it again"):
         files.read_json(tmp_path / "m.json")
 
 
