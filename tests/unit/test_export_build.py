@@ -1,0 +1,119 @@
+"""Compiling and packing: reproducible, and clear about what is missing."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import stat
+import sys
+import zipfile
+from pathlib import Path
+
+import casadi as ca
+import pytest
+from export_helpers import instance
+
+from exlinn_fmi import export
+from exlinn_fmi.errors import InputError, RunError, StorageError
+from exlinn_fmi.export import export_plant, export_system
+from exlinn_fmi.export.build import find_compiler
+from exlinn_fmi.mechanics.coordinates import Coordinate
+from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
+from exlinn_fmi.plants import plant
+
+PLANT = plant("dc_motor_cart")
+PENDULUM = LagrangianSystem.build(
+    (Coordinate("theta", "rad", topology="circle"),),
+    lambda q, v, p: v[0] ** 2 / 2 + 9.81 * ca.cos(q[0]),
+    lambda v, p: 0 * v[0],
+)
+
+
+def nothing_found(name: str, *_: object) -> None:
+    return None
+
+
+def test_public_names_are_sorted_and_exist() -> None:
+    assert export.__all__ == sorted(export.__all__)
+    assert all(hasattr(export, name) for name in export.__all__)
+
+
+def test_the_same_plant_gives_the_same_bytes(tmp_path: Path) -> None:
+    first, second = (export_plant(PLANT, tmp_path / name) for name in ("a.fmu", "b.fmu"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_a_folder_gets_the_file_under_the_models_name(tmp_path: Path) -> None:
+    assert export_system(PENDULUM, tmp_path, name="Pendulum") == tmp_path / "Pendulum.fmu"
+
+
+def test_no_member_depends_on_time_or_order(tmp_path: Path) -> None:
+    with zipfile.ZipFile(export_system(PENDULUM, tmp_path, name="Pendulum")) as archive:
+        infos = archive.infolist()
+    assert {i.date_time for i in infos} == {(1980, 1, 1, 0, 0, 0)}
+    assert [i.filename for i in infos] == sorted(i.filename for i in infos)
+
+
+def test_the_binary_names_no_folder_of_the_machine_that_built_it(tmp_path: Path) -> None:
+    with zipfile.ZipFile(export_system(PENDULUM, tmp_path, name="Pendulum")) as archive:
+        (binary,) = (archive.read(n) for n in archive.namelist() if n.startswith("binaries/"))
+    assert b"exlinn-export-" not in binary
+    assert str(Path.home()).encode() + b"/" not in binary
+
+
+def test_a_system_without_inputs_and_parameters_runs_and_keeps_its_energy(tmp_path: Path) -> None:
+    with instance(export_system(PENDULUM, tmp_path, name="Pendulum", start={"theta": 2.0})) as made:
+        made.start()
+        (before,) = made.get("E")
+        for k in range(100):
+            made.fmu.doStep(k * 0.01, 0.01)
+        assert made.get("E")[0] == pytest.approx(before, abs=1e-9)
+        assert made.get("theta")[0] != 2.0
+
+
+def test_the_environments_compiler_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", f"{sys.executable} -m some.compiler")
+    assert find_compiler() == [sys.executable, "-m", "some.compiler"]
+
+
+def test_the_compiler_asked_for_goes_before_the_environments(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert find_compiler(sys.executable) == [sys.executable]
+
+
+def test_a_compiler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match="compiler: no command 'no-such-cc'"):
+        find_compiler("no-such-cc -O3")
+    monkeypatch.setenv("CC", "no-such-cc")
+    with pytest.raises(InputError, match="environment variable CC: no command 'no-such-cc'"):
+        find_compiler()
+
+
+def test_ziglang_serves_where_there_is_no_system_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr(shutil, "which", nothing_found)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name == "ziglang" or None)
+    assert find_compiler() == [sys.executable, "-m", "ziglang", "cc"]
+
+
+def test_no_compiler_at_all_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr(shutil, "which", nothing_found)
+    monkeypatch.setattr(importlib.util, "find_spec", nothing_found)
+    with pytest.raises(InputError, match=r"no C compiler found.*pip install ziglang"):
+        find_compiler()
+
+
+def test_a_compiler_that_fails_is_quoted_and_nothing_is_written(tmp_path: Path) -> None:
+    script = tmp_path / "cc"
+    script.write_text("#!/bin/sh\necho 'out of stamps' >&2\nexit 1\n")
+    script.chmod(script.stat().st_mode | stat.S_IXUSR)
+    with pytest.raises(RunError, match=r"the C compiler failed: .*all\.c.*\nout of stamps\n"):
+        export_plant(PLANT, tmp_path / "x.fmu", compiler=str(script))
+    assert not (tmp_path / "x.fmu").exists()
+
+
+def test_a_path_that_cannot_be_written_is_a_storage_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="could not be written"):
+        export_plant(PLANT, tmp_path / "file" / "x.fmu")
