@@ -1,0 +1,324 @@
+"""FMU files: what is in one, checked before any of its code is loaded, and unpacking it.
+
+An FMU comes from outside, so nothing in it is believed: names in the archive, sizes, the XML and the model
+identifier are checked here. FMPy reads the model description.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+from xml.etree import ElementTree
+
+import fmpy
+
+from exlinn_fmi.components.base import Causality, Variability, Variable, VariableType
+from exlinn_fmi.errors import FmuError, StorageError, nearest
+
+DESCRIPTION = "modelDescription.xml"
+LARGEST_DESCRIPTION = 256 * 2**20
+"""Bytes of XML that are read at most: a compressed file of 1 MB can unpack to gigabytes."""
+
+_UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
+"""What zipfile raises for damaged, encrypted and unknown contents."""
+
+_INTEGERS = ("Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64")
+_TYPES: dict[str, VariableType] = {
+    "Real": "Real",
+    "Float32": "Real",
+    "Float64": "Real",
+    "Integer": "Integer",
+    **dict.fromkeys(_INTEGERS, "Integer"),
+    "Boolean": "Boolean",
+    "Enumeration": "Enumeration",
+}
+
+
+@dataclass(frozen=True)
+class FmuDescription:
+    """What an FMU says of itself, as far as a Co-Simulation master needs it.
+
+    Args:
+        path: the file.
+        version: FMI major version.
+        identifier: name of the binary.
+        token: GUID (FMI 2) or instantiation token (FMI 3).
+        variables: its scalar numeric variables; arrays, strings, binaries and clocks are left out.
+        accessors: for each variable, the name of its get and set functions less the prefix, e.g. ``Real``.
+        references: for each variable, its value reference.
+        equal_steps: whether all communication steps must be equally long.
+        saves_state: whether its state can be saved and restored.
+        once: whether the binary may be instantiated only once per process.
+        tool: the tool that must be installed for it to run, None where none is needed.
+        log_categories: names of the log categories that it has.
+    """
+
+    path: Path
+    version: Literal[2, 3]
+    identifier: str
+    token: str
+    variables: tuple[Variable, ...]
+    accessors: tuple[str, ...]
+    references: tuple[int, ...]
+    equal_steps: bool
+    saves_state: bool
+    once: bool
+    tool: str | None
+    log_categories: tuple[str, ...]
+
+    @property
+    def platform(self) -> str:
+        """Name of this machine's folder in ``binaries``."""
+        return str(fmpy.platform if self.version == 2 else fmpy.platform_tuple)
+
+
+def read_description(path: Path) -> FmuDescription:
+    """Read an FMU's model description; nothing is unpacked or loaded.
+
+    Raises:
+        FmuError: the file is missing or damaged, or no FMI 2.0 or 3.0 FMU for Co-Simulation.
+    """
+    with _archive(path) as archive:
+        root = _xml_root(path, _read_xml(path, archive))
+    version = root.get("fmiVersion", "")
+    if root.tag != "fmiModelDescription" or not version:
+        raise FmuError(f"{path}: {DESCRIPTION} begins with <{root.tag}>, expected <fmiModelDescription>")
+    if version != "2.0" and not re.match(r"3\.\d", version):
+        raise FmuError(
+            f"{path}: FMI version {version}; expected 2.0 or 3.0: export it again for one of these"
+        )
+    kinds = [kind for kind in ("ModelExchange", "ScheduledExecution") if root.find(kind) is not None]
+    if root.find("CoSimulation") is None:
+        found = f"it is for {' and '.join(kinds)} only" if kinds else "it names no kind of use"
+        raise FmuError(f"{path}: no Co-Simulation: {found}; export it again for Co-Simulation")
+    try:
+        return _description(path, fmpy.read_model_description(str(path), validate=False))
+    except FmuError:
+        raise
+    except Exception as error:  # FMPy reads what follows the schema; all else fails somewhere in it
+        raise FmuError(
+            f"{path}: {DESCRIPTION} does not follow FMI {version}: {_schema_problems(path, error)}"
+        ) from error
+
+
+def unpack(description: FmuDescription) -> Path:
+    """Unpack an FMU into a new temporary folder, less sources, documentation and other platforms' binaries.
+
+    Returns:
+        The folder, which is the caller's to remove.
+
+    Raises:
+        FmuError: it has no binary for this platform, or is damaged.
+        StorageError: it does not fit on the disk.
+    """
+    path = description.path
+    own = f"binaries/{description.platform}/"
+    with _archive(path) as archive:
+        _check_binary(description, archive.namelist())
+        wanted = [
+            info
+            for info in archive.infolist()
+            if not info.filename.startswith(("sources/", "documentation/", "binaries/"))
+            or info.filename.startswith(own)
+        ]
+        folder = Path(tempfile.mkdtemp(prefix="exlinn-fmu-"))
+        try:
+            size, free = sum(info.file_size for info in wanted), shutil.disk_usage(folder).free
+            if size > free:
+                raise StorageError(
+                    f"{path}: unpacked it takes {size / 1e6:.0f} MB, but {folder.parent} has only "
+                    f"{free / 1e6:.0f} MB free"
+                )
+            archive.extractall(folder, wanted)
+        except BaseException as error:
+            shutil.rmtree(folder, ignore_errors=True)
+            if isinstance(error, OSError):
+                raise StorageError(f"{path}: cannot be unpacked to {folder.parent}: {error}") from error
+            raise
+    return folder
+
+
+# ── the archive ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+@contextmanager
+def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    """The FMU as a zip archive whose names have been checked.
+
+    Raises:
+        FmuError: it cannot be read, also where that shows only while it is used.
+    """
+    if not path.is_file():
+        what = "is a folder, expected an .fmu file" if path.is_dir() else "no such file"
+        beside = [p.name for p in path.parent.glob("*.fmu")] if path.parent.is_dir() else []
+        raise FmuError(f"{path}: {what}; {nearest(path.name, beside, 'FMUs there')}")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _check_names(path, archive.namelist())
+            yield archive
+    except _UNREADABLE as error:
+        with path.open("rb") as file:
+            is_zip = file.read(2) == b"PK"
+        what = "the zip archive is damaged or cut short" if is_zip else "not a zip archive, as every FMU is"
+        size = path.stat().st_size
+        raise FmuError(f"{path}: {what} ({size} bytes; {error}); copy or export it again") from error
+    except PermissionError as error:
+        raise FmuError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _check_names(path: Path, names: Sequence[str]) -> None:
+    """Refuse archives whose members would land outside the folder or on one another."""
+    seen: set[str] = set()
+    for name in names:
+        parts = PurePosixPath(name)
+        if parts.is_absolute() or ".." in parts.parts or "\\" in name or ":" in name:
+            raise FmuError(f"{path}: the archive holds {name!r}, which would be written outside its folder")
+        if str(parts) in seen:
+            raise FmuError(f"{path}: the archive holds {name!r} twice; export it again")
+        seen.add(str(parts))
+
+
+def _read_xml(path: Path, archive: zipfile.ZipFile) -> bytes:
+    """The bytes of the model description."""
+    names = archive.namelist()
+    if DESCRIPTION not in names:
+        deeper = next((n for n in names if n.endswith(f"/{DESCRIPTION}")), None)
+        hint = f"it lies in {deeper!r}: zip the folder's contents, not the folder" if deeper else "no FMU"
+        raise FmuError(f"{path}: no {DESCRIPTION} at the top of the archive; {hint}")
+    size = archive.getinfo(DESCRIPTION).file_size
+    if size > LARGEST_DESCRIPTION:
+        raise FmuError(
+            f"{path}: {DESCRIPTION} is {size / 2**20:.0f} MiB, expected at most "
+            f"{LARGEST_DESCRIPTION / 2**20:.0f} MiB"
+        )
+    return archive.read(DESCRIPTION)
+
+
+def _xml_root(path: Path, data: bytes) -> ElementTree.Element:
+    try:
+        return ElementTree.fromstring(data)
+    except ElementTree.ParseError as error:
+        raise FmuError(f"{path}: {DESCRIPTION} is no well-formed XML: {error}") from error
+
+
+def _schema_problems(path: Path, error: Exception) -> str:
+    """The first problems that the FMI schema finds, or else FMPy's own error."""
+    try:
+        fmpy.read_model_description(str(path), validate=True)
+    except fmpy.model_description.ValidationError as invalid:
+        return "; ".join(str(problem) for problem in invalid.problems[:3])
+    except Exception as other:
+        return f"{type(other).__name__}: {other}"
+    return f"{type(error).__name__}: {error}"
+
+
+def _check_binary(description: FmuDescription, names: Sequence[str]) -> None:
+    """Refuse an FMU without a binary for this platform.
+
+    Raises:
+        FmuError: says which there are, and what to do.
+    """
+    path, platform = description.path, description.platform
+    library = f"{description.identifier}{fmpy.sharedLibraryExtension}"
+    if f"binaries/{platform}/{library}" in names:
+        return
+    files = [PurePosixPath(n).parts for n in names if n.startswith("binaries/") and not n.endswith("/")]
+    platforms = sorted({parts[1] for parts in files if len(parts) > 2})
+    if platform in platforms:
+        here = ", ".join(sorted(parts[-1] for parts in files if parts[1] == platform))
+        raise FmuError(f"{path}: binaries/{platform} has no {library} (found: {here}); export it again")
+    sources = any(n.startswith("sources/") and n.endswith(".c") for n in names)
+    build = f", or build the sources in it: fmpy compile {path.name}" if sources else ""
+    raise FmuError(
+        f"{path}: no binary for {platform} in it (found: {', '.join(platforms) or 'none'}); "
+        f"export it again for {platform}{build}"
+    )
+
+
+# ── the model description ────────────────────────────────────────────────────────────────────────────────
+
+
+def _description(path: Path, model: Any) -> FmuDescription:
+    """Our description from FMPy's."""
+    use = model.coSimulation
+    identifier = use.modelIdentifier or ""
+    if not identifier or set(identifier) & set("/\\:\0") or identifier in (".", ".."):
+        raise FmuError(f"{path}: the model identifier {identifier!r} is no file name")
+    scalars = [v for v in model.modelVariables if v.type in _TYPES and not v.dimensions]
+    names = [v.name for v in scalars]
+    if len(set(names)) < len(names):
+        twice = next(name for k, name in enumerate(names) if name in names[:k])
+        raise FmuError(f"{path}: two variables are called {twice!r}")
+    version: Literal[2, 3] = 2 if model.fmiVersion == "2.0" else 3
+    enumeration = "Integer" if version == 2 else "Int64"
+    inputs = {v.valueReference: v.name for v in scalars if v.causality == "input"}
+    depends = {
+        unknown.variable.valueReference: None
+        if unknown.dependencies is None
+        else tuple(inputs[d.valueReference] for d in unknown.dependencies if d.valueReference in inputs)
+        for unknown in model.outputs
+    }
+    return FmuDescription(
+        path=path,
+        version=version,
+        identifier=identifier,
+        token=model.guid or "",
+        variables=tuple(_variable(path, v, depends) for v in scalars),
+        accessors=tuple(enumeration if v.type == "Enumeration" else v.type for v in scalars),
+        references=tuple(v.valueReference for v in scalars),
+        equal_steps=not use.canHandleVariableCommunicationStepSize,
+        saves_state=use.canGetAndSetFMUstate,
+        once=use.canBeInstantiatedOnlyOncePerProcess,
+        tool=(model.generationTool or "the tool that made it") if use.needsExecutionTool else None,
+        log_categories=tuple(category.name for category in model.logCategories),
+    )
+
+
+def _variable(path: Path, v: Any, depends: dict[int, tuple[str, ...] | None]) -> Variable:
+    """One variable in our words.
+
+    Raises:
+        FmuError: its start value or range is no number.
+    """
+    declared = v.declaredType
+    causality: Causality = v.causality
+    variability: Variability = v.variability
+    if v.causality == "calculatedParameter":
+        causality = "local"
+    elif v.causality == "structuralParameter":
+        # It sizes arrays, and could only change in configuration mode, which we do not enter.
+        causality, variability = "local", "constant"
+    low, high = v.min or getattr(declared, "min", None), v.max or getattr(declared, "max", None)
+    if v.type == "Enumeration" and declared is not None and declared.items:
+        items = [int(item.value) for item in declared.items]
+        low, high = min(items), max(items)
+    try:
+        return Variable(
+            name=v.name,
+            causality=causality,
+            variability=variability,
+            unit=v.unit or getattr(declared, "unit", None),
+            type=_TYPES[v.type],
+            start=_number(v.start),
+            description=v.description or "",
+            depends_on=depends.get(v.valueReference) if causality == "output" else (),
+            min=_number(low),
+            max=_number(high),
+        )
+    except ValueError as error:
+        raise FmuError(f"{path}: variable {v.name!r} (line {v.sourceline}): {error}") from error
+
+
+def _number(text: str | int | None) -> float | None:
+    """A start value or bound of the XML as a number, booleans as 0 and 1."""
+    if text is None:
+        return None
+    return {"true": 1.0, "false": 0.0}[text] if text in ("true", "false") else float(text)
