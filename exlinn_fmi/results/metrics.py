@@ -1,0 +1,226 @@
+"""How well a closed loop was controlled: tracking errors, violations, solver effort, from recorded rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from exlinn_fmi.scenario.schema import Bounds, Nmpc, NmpcComponent, Scenario
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+DIAGNOSTICS = ("reference", "cost", "solve_status", "iterations", "kkt", "solve_time", "fallbacks")
+"""Outputs of a controller that are not inputs of the plant."""
+BOUND_TOLERANCE = 1e-6
+"""Share of the range between two bounds by which a value may be outside: the solver's tolerance."""
+
+
+@dataclass(frozen=True)
+class Loop:
+    """One controller and the plant variables around it, as the connections tell.
+
+    Args:
+        controller: name of the controller component.
+        start: time of its first sample [s].
+        period: its sampling time [s].
+        settings: its part of the scenario.
+        inputs: plant input by name of the controller's output that drives it.
+        states: plant variable by name of the model state that it is measured for.
+        output: plant variable that should follow the reference, None where that is not known.
+    """
+
+    controller: str
+    start: float
+    period: float
+    settings: Nmpc
+    inputs: Mapping[str, str]
+    states: Mapping[str, str]
+    output: str | None
+
+    def own(self, output: str) -> str:
+        """Path of one of the controller's outputs."""
+        return f"{self.controller}.{output}"
+
+    def reference_of(self, state: str) -> str:
+        """Path of the reference of a model state."""
+        return self.own(f"reference_{state}")
+
+    def bounded(self) -> list[tuple[str, str, Bounds]]:
+        """(plant variable, the controller's own column of it or "", bounds) for every bounded variable."""
+        inputs = [
+            (self.inputs.get(name, self.own(name)), self.own(name), bounds)
+            for name, bounds in self.settings.inputs.items()
+        ]
+        states = [
+            (self.states[name], "", bounds)
+            for name, bounds in self.settings.states.items()
+            if name in self.states
+        ]
+        return inputs + states
+
+    def samples(self, time: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which rows are at the controller's own sampling times.
+
+        Args:
+            time: time of each row [s], shape (N,).
+
+        Returns:
+            Shape (N,). Between these rows the controller's outputs, its reference too, are held.
+        """
+        ticks = (time - self.start) / self.period
+        near: NDArray[np.bool_] = np.abs(ticks - np.rint(ticks)) < 1e-6
+        return near
+
+
+def control_loops(scenario: Scenario) -> list[Loop]:
+    """The controllers of a scenario that is simulated."""
+    if scenario.simulate is None:
+        return []
+    connections = scenario.connection_list()
+    loops = []
+    for name, component in scenario.components.items():
+        if not isinstance(component, NmpcComponent):
+            continue
+        inputs: dict[str, str] = {}
+        for source, target in connections:
+            owner, variable = source.split(".", 1)
+            if owner == name and variable not in DIAGNOSTICS and not variable.startswith("reference_"):
+                inputs.setdefault(variable, target)
+        states = {
+            target.split(".", 1)[1]: source
+            for source, target in connections
+            if target.split(".", 1)[0] == name
+        }
+        loops.append(
+            Loop(
+                controller=name,
+                start=scenario.simulate.start,
+                period=component.step or scenario.simulate.step,
+                settings=component.nmpc,
+                inputs=inputs,
+                states=states,
+                output=_tracked(scenario, component.nmpc, inputs, states),
+            )
+        )
+    return loops
+
+
+def control_metrics(frame: pd.DataFrame, scenario: Scenario, units: Mapping[str, str]) -> dict[str, float]:
+    """Metrics of every controller in a scenario, from what the co-simulation recorded.
+
+    Errors, effort and cost are taken at the controller's own samples, where its outputs are fresh; violations
+    are counted in all rows. A metric whose columns were not recorded is left out.
+
+    Args:
+        frame: trajectories, columns ``time`` [s] and ``component.variable``.
+        scenario: the scenario as run.
+        units: unit by column.
+
+    Returns:
+        ``control.<metric>``, or ``control.<controller>.<metric>`` where there is more than one controller.
+    """
+    loops = control_loops(scenario)
+    metrics: dict[str, float] = {}
+    for loop in loops:
+        prefix = "control." if len(loops) == 1 else f"control.{loop.controller}."
+        own = {
+            **_tracking(frame, loop, units, scenario.metrics.settle),
+            **_violations(frame, loop),
+            **_effort(frame, loop),
+        }
+        metrics |= {prefix + key: value for key, value in own.items()}
+    return metrics
+
+
+def quantity(path: str, unit: str) -> str:
+    """A variable as part of a metric's key, with its unit: ``plant.x`` in m is ``x_m``."""
+    words = f"{path.split('.', 1)[1]} {'' if unit == '1' else unit}"
+    return "_".join("".join(c if c.isalnum() else " " for c in words.replace("_", " ")).split())
+
+
+def outside(values: NDArray[np.float64], bounds: Bounds) -> NDArray[np.bool_]:
+    """Which values are outside their bounds by more than the solver's tolerance; NaN is outside.
+
+    Args:
+        values: shape (N,).
+        bounds: lower and upper bound, of the same unit.
+    """
+    low = -np.inf if bounds.min is None else bounds.min
+    high = np.inf if bounds.max is None else bounds.max
+    finite = [b for b in (low, high) if np.isfinite(b)]
+    span = high - low if len(finite) == 2 else max(map(abs, finite), default=0.0)
+    slack = BOUND_TOLERANCE * span
+    beyond: NDArray[np.bool_] = ~((values >= low - slack) & (values <= high + slack))
+    return beyond
+
+
+def _tracked(
+    scenario: Scenario, settings: Nmpc, inputs: Mapping[str, str], states: Mapping[str, str]
+) -> str | None:
+    """The plant variable that follows the controller's `reference`."""
+    named = scenario.metrics.output
+    neighbours = {path.split(".", 1)[0] for path in (*inputs.values(), *states.values())}
+    if named is not None and named.split(".", 1)[0] in neighbours:
+        return named
+    reference = settings.reference
+    return states.get(reference.coordinate) if reference.through is None else None
+
+
+def _tracking(frame: pd.DataFrame, loop: Loop, units: Mapping[str, str], settle: float) -> dict[str, float]:
+    """Root mean square and largest distance of the output from its reference, after settling."""
+    reference = loop.own("reference")
+    if loop.output is None or not {loop.output, reference} <= set(frame.columns):
+        return {}
+    time = frame["time"].to_numpy(dtype=float)
+    rows = loop.samples(time) & (time >= loop.start + settle - 1e-6 * loop.period)
+    error = (frame[loop.output] - frame[reference]).to_numpy(dtype=float)[rows]
+    if not error.size:
+        return {}
+    name = quantity(loop.output, units.get(loop.output, ""))
+    return {
+        f"rmse_{name}": float(np.sqrt(np.mean(error**2))),
+        f"max_error_{name}": float(np.max(np.abs(error))),
+    }
+
+
+def _violations(frame: pd.DataFrame, loop: Loop) -> dict[str, float]:
+    """Number of values outside the controller's bounds; left out where one of them was not recorded."""
+    count = 0
+    for path, own, bounds in loop.bounded():
+        column = next((c for c in (path, own) if c in frame.columns), None)
+        if column is None:
+            return {}
+        count += int(np.count_nonzero(outside(frame[column].to_numpy(dtype=float), bounds)))
+    return {"violations": float(count)} if len(frame) else {}
+
+
+def _effort(frame: pd.DataFrame, loop: Loop) -> dict[str, float]:
+    """Solve time, fallbacks, iterations, cost and input power, each where it was recorded."""
+    rows = loop.samples(frame["time"].to_numpy(dtype=float))
+
+    def recorded(output: str) -> NDArray[np.float64]:
+        if loop.own(output) not in frame.columns:
+            return np.empty(0)
+        values: NDArray[np.float64] = frame[loop.own(output)].to_numpy(dtype=float)[rows]
+        return values[np.isfinite(values)]
+
+    metrics: dict[str, float] = {}
+    if (solve := 1e3 * recorded("solve_time")).size:
+        metrics["solve_ms_median"] = float(np.median(solve))
+        metrics["solve_ms_p99"] = float(np.percentile(solve, 99))
+        metrics["solve_ms_max"] = float(np.max(solve))
+    if (fallbacks := recorded("fallbacks")).size:
+        metrics["fallbacks"] = float(fallbacks[-1])
+    for output in ("iterations", "cost"):
+        if (values := recorded(output)).size:
+            metrics[f"{output}_mean"] = float(np.mean(values))
+    for name in loop.inputs:
+        if (values := recorded(name)).size:
+            key = "input_rms" if len(loop.inputs) == 1 else f"input_rms_{name}"
+            metrics[key] = float(np.sqrt(np.mean(values**2)))
+    return metrics
