@@ -20,10 +20,17 @@ class Spec(BaseModel):
 
 
 def form(value: Any) -> str:
-    """What a value is, in the words of error texts; tells apart the forms that a setting may be written in."""
+    """What a value is, in the words of error texts; tells the forms apart that a setting may have."""
     if isinstance(value, bool):
         return "true or false"
-    names = {int: "a number", float: "a number", str: "text", list: "a list", tuple: "a list", dict: "a mapping"}
+    names = {
+        int: "a number",
+        float: "a number",
+        str: "text",
+        list: "a list",
+        tuple: "a list",
+        dict: "a mapping",
+    }
     return next((name for kind, name in names.items() if isinstance(value, kind)), "nothing")
 
 
@@ -43,7 +50,7 @@ class Constant(Spec):
     """A constant value."""
 
     signal: Literal["constant"]
-    value: float = Field(description="value")
+    value: float = Field(description="the value, at all times")
     unit: str | None = Field(None, description="unit of the signal, e.g. V")
 
 
@@ -155,7 +162,7 @@ class ScotchYoke(Spec):
 
 
 class Linear(Spec):
-    """A quantity proportional to the coordinate, y = gain · coordinate + offset (a gear, a rack, a spindle)."""
+    """A quantity proportional to the coordinate, y = gain · coordinate + offset (a gear, a spindle)."""
 
     map: Literal["linear"]
     gain: float = Field(1.0, description="gain")
@@ -186,9 +193,7 @@ class Weights(Spec):
     inputs: Weight = Field(1e-3, description="R, on u, or on u − u_ref for tracking")
     terminal: Annotated[
         Annotated[Literal["dare"], Tag("text")] | Annotated[NonNegative, Tag("a number")], Discriminator(form)
-    ] = Field(
-        "dare", description="terminal cost: the Riccati solution at the reference, or a multiple of Q"
-    )
+    ] = Field("dare", description="terminal cost: the Riccati solution at the reference, or a multiple of Q")
 
 
 class Nmpc(Spec):
@@ -314,7 +319,7 @@ class CoordinateSpec(Spec):
     kind: Kind = Field("mechanical", description="mechanical or electrical")
     topology: Topology = Field(
         "line",
-        description="line; circle (an angle: the model is periodic in it); cyclic (no influence, e.g. a charge)",
+        description="line; circle (an angle: the model is periodic in it); cyclic (a charge: no influence)",
     )
     position: VariablePath | None = Field(
         None, description="plant variable that is q; not needed where cyclic"
@@ -352,9 +357,7 @@ class Experiment(Spec):
     duration: Positive = Field(description="duration [s]")
     step: Positive = Field(1e-3, description="sampling step [s]")
     inputs: dict[VariablePath, Signal] = Field(description="signal for each driven plant input")
-    start: dict[str, StartValue] = Field(
-        default_factory=dict, description="start values of plant variables"
-    )
+    start: dict[str, StartValue] = Field(default_factory=dict, description="start values of plant variables")
 
 
 class Structured(Spec):
@@ -388,8 +391,8 @@ class Paper(Spec):
 class Identify(Spec):
     """Read physical parameters off the learned model: 𝓛 = Σ p·φ(q, q̇), D = Σ p·ψ(q̇) with these monomials.
 
-    A name is a parameter of the plant or a product of some, e.g. `m_c*d^2`; where the plant states their values
-    the report gives the relative error.
+    A name is a parameter of the plant or a product of some, e.g. `m_c*d^2`; where the plant states their
+    values the report gives the relative error.
     """
 
     lagrangian: dict[str, str] = Field(

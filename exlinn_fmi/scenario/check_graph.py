@@ -1,0 +1,161 @@
+"""Checks across sections: connections, start values, steps, what is recorded and judged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from fnmatch import fnmatchcase
+
+from exlinn_fmi.components.base import Variable
+from exlinn_fmi.components.starts import takes_start, value_problem
+from exlinn_fmi.scenario.explain import Finding
+from exlinn_fmi.scenario.survey import Survey
+from exlinn_fmi.scenario.units import same_unit
+from exlinn_fmi.scenario.words import KeyPath, suggestion
+
+_FITS = {("Integer", "Enumeration"), ("Enumeration", "Integer"), ("Boolean", "Integer")}
+"""Pairs of types, from and to, between which no value is lost; a Real takes any."""
+
+
+def connections(survey: Survey) -> Iterator[Finding]:
+    """Ends that do not exist or do not fit, and targets that are driven twice."""
+    driven: dict[str, str] = {}
+    for source, targets in survey.scenario.connections.items():
+        at: KeyPath = ("connections", source)
+        tail, problem = survey.find(source, "output")
+        if problem:
+            yield at, problem
+        several = isinstance(targets, list)
+        for k, target in enumerate(targets if isinstance(targets, list) else [targets]):
+            here = (*at, k) if several else at
+            head, problem = survey.find(target, "input")
+            if problem:
+                yield here, problem
+            if target in driven:
+                yield here, f"{target} is driven twice, by {driven[target]} and by {source}; keep one"
+            driven.setdefault(target, source)
+            if tail is not None and head is not None:
+                yield from ((here, message) for message in _misfits(source, tail, target, head))
+
+
+def _misfits(source: str, tail: Variable, target: str, head: Variable) -> Iterator[str]:
+    """Why one variable cannot drive another."""
+    if tail.causality == "input" and head.causality == "output":
+        yield f"{source} is an input and {target} an output; a connection reads from: to, so swap them"
+        return
+    if tail.causality == "input":
+        yield f"{source} is an input; a connection begins at an output"
+    if head.causality == "parameter" and head.variability != "tunable":
+        component, name = target.split(".", 1)
+        yield f"{target} is a {head.variability} parameter; set it in components.{component}.start.{name}"
+    elif head.causality not in ("input", "parameter"):
+        kind = "an output" if head.causality == "output" else "no input"
+        yield f"{target} is {kind}; a connection ends at an input"
+    if not same_unit(tail.unit, head.unit):
+        yield f"unit mismatch: {source} [{tail.unit}] → {target} [{head.unit}]"
+    if head.type not in ("Real", tail.type) and (tail.type, head.type) not in _FITS:
+        yield f"type mismatch: {source} is {tail.type}, {target} is {head.type}"
+
+
+def start_values(survey: Survey) -> Iterator[Finding]:
+    """Start values of what is not there, or that a variable does not take."""
+    for name, spec in survey.scenario.components.items():
+        known = survey.variables.get(name)
+        if known is not None:
+            yield from misfit_starts(("components", name, "start"), spec.start, name, known)
+
+
+def misfit_starts(
+    at: KeyPath, starts: Mapping[str, float | bool], component: str, known: Mapping[str, Variable]
+) -> Iterator[Finding]:
+    """Start values that the variables of a component do not take.
+
+    Args:
+        at: where the start values stand.
+        starts: the values by variable.
+        component: name of the component.
+        known: its variables by name.
+    """
+    for name, value in starts.items():
+        variable = known.get(name)
+        if variable is None:
+            names = [v.name for v in known.values() if takes_start(v)]
+            hint = suggestion(name, names, "those that take a start value")
+            yield (*at, name), f"{component} has no variable {name!r}{hint}"
+        elif not takes_start(variable):
+            yield (*at, name), f"{component}.{name} is calculated by the component and takes no start value"
+        elif isinstance(value, bool) and variable.type != "Boolean":
+            yield (*at, name), f"expected a number, found {'true' if value else 'false'}"
+        elif problem := value_problem(variable, float(value)):
+            yield (*at, name), problem
+
+
+def steps(survey: Survey) -> Iterator[Finding]:
+    """Steps that do not fit the run or each other."""
+    simulate, at = survey.scenario.simulate, ("simulate",)
+    if simulate is None:
+        return
+    if simulate.stop <= simulate.start:
+        yield (*at, "stop"), f"expected > {simulate.start:g} (simulate.start), found {simulate.stop:g}"
+    elif survey.sound.in_doubt(at, "step"):
+        return
+    elif simulate.step > simulate.stop - simulate.start:
+        span = simulate.stop - simulate.start
+        yield (*at, "step"), f"the step, {simulate.step:g} s, is longer than the run, {span:g} s"
+    for name, spec in survey.scenario.components.items():
+        if spec.step is not None and not is_multiple(spec.step, simulate.step):
+            yield ("components", name, "step"), no_multiple(spec.step, simulate.step, "simulate.step")
+
+
+def is_multiple(own: float, base: float) -> bool:
+    """Whether a step is an integer multiple of another, as far as decimals can be."""
+    ratio = own / base
+    return round(ratio) >= 1 and abs(ratio - round(ratio)) <= 1e-9 * ratio
+
+
+def no_multiple(own: float, base: float, name: str) -> str:
+    """Error text on a step that is not a multiple of another."""
+    near = max(1, round(own / base)) * base
+    return f"expected a multiple of {name}, {base:g} s, found {own:g} s; the nearest is {near:g} s"
+
+
+def recorded(survey: Survey) -> Iterator[Finding]:
+    """Names to record that match nothing, and a metric of what is not recorded."""
+    simulate = survey.scenario.simulate
+    patterns = simulate.record if simulate is not None else []
+    for k, pattern in enumerate(patterns):
+        problem = _no_match(survey, pattern)
+        if problem:
+            yield ("simulate", "record", k), problem
+    metrics = survey.scenario.metrics
+    if simulate is not None and metrics.settle >= simulate.stop - simulate.start > 0:
+        span = simulate.stop - simulate.start
+        yield (
+            ("metrics", "settle"),
+            f"leaves nothing to judge: expected < {span:g} (the run), found {metrics.settle:g}",
+        )
+    if metrics.output is not None:
+        _, problem = survey.find(metrics.output, "output")
+        if problem is None and simulate is not None and not any(matches(metrics.output, p) for p in patterns):
+            problem = f"{metrics.output} is not recorded; add it to simulate.record"
+        if problem:
+            yield ("metrics", "output"), problem
+
+
+def matches(path: str, pattern: str) -> bool:
+    """Whether a variable is meant by a name with the wildcards * and ?; brackets stand for themselves."""
+    return fnmatchcase(path, pattern.replace("[", "[[]"))
+
+
+def _no_match(survey: Survey, pattern: str) -> str | None:
+    """Why a name to record means nothing, None where it means something or that is not known."""
+    if not any(wildcard in pattern for wildcard in "*?"):
+        if "." not in pattern:
+            return f"expected component.variable or a pattern such as {pattern}.*, found {pattern!r}"
+        return survey.find(pattern, "output")[1]
+    if any(matches(f"{name}.{v}", pattern) for name, known in survey.variables.items() for v in known):
+        return None
+    component = pattern.split(".", 1)[0]
+    unknown = [name for name in survey.names if name not in survey.variables]
+    if any(matches(name, component) for name in unknown) or survey.sound.in_doubt((), "components"):
+        return None
+    return f"{pattern!r} matches no variable; components: {', '.join(survey.names)}"

@@ -1,0 +1,258 @@
+"""Checks across sections: signals, what is learned from which plant, and the controller around the model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from exlinn_fmi.components.base import Variable
+from exlinn_fmi.errors import DataError, ModelError
+from exlinn_fmi.mechanics.coordinates import Coordinate
+from exlinn_fmi.scenario.check_graph import is_multiple, misfit_starts, no_multiple
+from exlinn_fmi.scenario.explain import Finding
+from exlinn_fmi.scenario.schema import (
+    Bounds,
+    Chirp,
+    CoordinateSpec,
+    Experiment,
+    Identify,
+    Learn,
+    ModelComponent,
+    Multisine,
+    Nmpc,
+    NmpcComponent,
+    Paper,
+    Ramp,
+    Signal,
+    SignalComponent,
+    Structured,
+    Table,
+)
+from exlinn_fmi.scenario.survey import Survey
+from exlinn_fmi.scenario.units import same_unit
+from exlinn_fmi.scenario.words import KeyPath, suggestion
+
+# ── signals ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def signals(survey: Survey) -> Iterator[Finding]:
+    """Signals, wherever they stand, that make no sense."""
+    for name, spec in survey.scenario.components.items():
+        if isinstance(spec, SignalComponent):
+            yield from _signal(("components", name, "source"), spec.source, survey.folder)
+        if isinstance(spec, NmpcComponent):
+            trajectory: KeyPath = ("components", name, "nmpc", "reference", "trajectory")
+            yield from _signal(trajectory, spec.nmpc.reference.trajectory, survey.folder)
+    for at, experiment in _experiments(survey.scenario.learn):
+        for target, signal in experiment.inputs.items():
+            yield from _signal((*at, "inputs", target), signal, survey.folder)
+
+
+def _signal(at: KeyPath, signal: Signal, folder: Path) -> Iterator[Finding]:
+    if isinstance(signal, Multisine | Chirp):
+        low, high = signal.band
+        if not low < high:
+            yield (*at, "band"), f"expected the lower frequency first, found [{low:g}, {high:g}]"
+    if isinstance(signal, Ramp) and signal.stop is not None and signal.stop <= signal.start:
+        yield (*at, "stop"), f"expected > {signal.start:g} (start), found {signal.stop:g}"
+    if isinstance(signal, Table):
+        from exlinn_fmi.data.excitation import signal_function
+
+        try:
+            signal_function(signal, folder)
+        except DataError as error:
+            yield (*at, "file"), str(error)
+
+
+# ── learning ─────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def learning(survey: Survey) -> Iterator[Finding]:
+    """A `learn` section that does not fit its plant."""
+    learn = survey.scenario.learn
+    if learn is None:
+        return
+    plant = survey.scenario.components.get(learn.plant)
+    if learn.plant not in survey.names and not survey.sound.in_doubt((), "components"):
+        hint = suggestion(learn.plant, survey.names, "components")
+        yield ("learn", "plant"), f"there is no component {learn.plant!r}{hint}"
+    if isinstance(plant, SignalComponent | NmpcComponent):
+        kind = "a signal source" if isinstance(plant, SignalComponent) else "a controller"
+        yield ("learn", "plant"), f"{learn.plant} is {kind}, nothing that can be learned"
+    if isinstance(plant, ModelComponent) and plant.model == "learned":
+        yield ("learn", "plant"), f"{learn.plant} is what is learned here; name the component to learn from"
+    for k, spec in enumerate(learn.coordinates):
+        yield from _coordinate(("learn", "coordinates", k), spec, learn.plant, survey)
+    for at, experiment in _experiments(learn):
+        yield from _experiment(at, experiment, survey, learn)
+    yield from _monomials(learn, survey.coordinates)
+
+
+def _coordinate(at: KeyPath, spec: CoordinateSpec, plant: str, survey: Survey) -> Iterator[Finding]:
+    """Plant variables of a coordinate that are not there, or not what they are said to be."""
+    whole = spec.coordinate()
+    ends = (
+        ("position", spec.position, whole.unit, "unit"),
+        ("velocity", spec.velocity, whole.velocity_unit, "velocity_unit"),
+        ("acceleration", spec.acceleration, whole.acceleration_unit, "velocity_unit"),
+        ("input", spec.input, whole.input_unit, "input_unit"),
+    )
+    for key, path, unit, unit_key in ends:
+        if path is None:
+            continue
+        variable, problem = _plant_variable(path, plant, survey, "input" if key == "input" else "output")
+        if problem is not None:
+            yield (*at, key), problem
+        elif variable is not None and not same_unit(unit, variable.unit):
+            hint = "" if key == "acceleration" else f"; say `{unit_key}: {variable.unit}`"
+            yield (
+                (*at, key),
+                f"unit mismatch: {spec.name} has {key} [{unit}], {path} is [{variable.unit}]{hint}",
+            )
+
+
+def _plant_variable(path: str, plant: str, survey: Survey, role: str) -> tuple[Variable | None, str | None]:
+    """A variable of the plant to learn, or what is wrong with it."""
+    component, name = path.split(".", 1)
+    if component != plant and component in survey.names:
+        return None, f"{path} is no variable of the plant to learn; write {plant}.{name}"
+    variable, problem = survey.find(path, "input" if role == "input" else "output")
+    if variable is not None and (variable.causality == "input") != (role == "input"):
+        found = "an input" if variable.causality == "input" else "no input"
+        problem = f"{path} is {found}; expected an {role} of {plant}"
+    return variable, problem
+
+
+def _experiments(learn: Learn | None) -> Iterator[tuple[KeyPath, Experiment]]:
+    if learn is not None:
+        for section, experiments in (("training", learn.training), ("test", learn.test)):
+            yield from ((("learn", section, k), experiment) for k, experiment in enumerate(experiments))
+
+
+def _experiment(at: KeyPath, experiment: Experiment, survey: Survey, learn: Learn) -> Iterator[Finding]:
+    """An experiment whose steps, inputs or start values do not fit the plant."""
+    if experiment.step > experiment.duration:
+        yield (
+            (*at, "step"),
+            f"the step, {experiment.step:g} s, is longer than the run, {experiment.duration:g} s",
+        )
+    plant = survey.scenario.components.get(learn.plant)
+    if plant is not None and plant.step is not None and not is_multiple(plant.step, experiment.step):
+        message = no_multiple(plant.step, experiment.step, "the experiment's step")
+        yield (*at, "step"), f"{learn.plant} has a step of its own: {message}"
+    modelled = [c.input for c in survey.coordinates if c.input]
+    for target, signal in experiment.inputs.items():
+        variable, problem = _plant_variable(target, learn.plant, survey, "input")
+        if problem is None and modelled and target.split(".", 1)[1] not in modelled:
+            problem = (
+                f"{target} is driven, but no coordinate has it as `input`: the model would not know of it"
+            )
+        if problem is not None:
+            yield (*at, "inputs", target), problem
+        elif variable is not None and not same_unit(signal.unit, variable.unit):
+            yield (
+                (*at, "inputs", target),
+                f"unit mismatch: signal [{signal.unit}] → {target} [{variable.unit}]",
+            )
+    known = survey.variables.get(learn.plant)
+    if known is not None:
+        yield from misfit_starts((*at, "start"), experiment.start, learn.plant, known)
+
+
+def _monomials(learn: Learn, coordinates: tuple[Coordinate, ...]) -> Iterator[Finding]:
+    """Features and terms that cannot be read, or that name what the model does not have."""
+    if not coordinates:
+        return
+    from exlinn_fmi.mechanics.monomials import parse_monomial
+
+    velocities = [c.velocity for c in coordinates]
+    names = [c.name for c in coordinates if c.topology != "cyclic"] + velocities
+    for at, text in _terms(learn.method, learn.identify):
+        try:
+            parse_monomial(text, velocities if "dissipation" in str(at[2]) else names)
+        except ModelError as error:
+            yield at, str(error)
+
+
+def _terms(method: Structured | Paper, identify: Identify) -> Iterator[tuple[KeyPath, str]]:
+    """All monomials of a `learn` section, with where they stand."""
+    if isinstance(method, Paper):
+        for key in ("lagrangian_features", "dissipation_features"):
+            yield from ((("learn", "method", key, k), text) for k, text in enumerate(getattr(method, key)))
+    for key in ("lagrangian", "dissipation"):
+        for name, text in getattr(identify, key).items():
+            yield ("learn", "identify", key, name), text
+
+
+# ── control ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def control(survey: Survey) -> Iterator[Finding]:
+    """Components that lack the learned model they need, and controllers that do not fit their model."""
+    for name, spec in survey.scenario.components.items():
+        at: KeyPath = ("components", name)
+        if isinstance(spec, ModelComponent) and spec.model == "learned":
+            yield from _learned((*at, "model"), survey)
+        if isinstance(spec, NmpcComponent):
+            if spec.nmpc.model == "learned" and not survey.sound.in_doubt((*at, "nmpc"), "model"):
+                yield from _learned((*at, "nmpc", "model"), survey)
+            known = survey.variables.get(name)
+            states = inputs = None
+            if known is not None:
+                states = {v.name: v for v in known.values() if v.causality == "input"}
+                outputs = [v.name for v in known.values() if v.causality == "output"]
+                inputs = outputs[: outputs.index("reference")]
+            yield from _controller((*at, "nmpc"), spec.nmpc, states, inputs)
+
+
+def _learned(at: KeyPath, survey: Survey) -> Iterator[Finding]:
+    if survey.scenario.learn is None and not survey.sound.in_doubt((), "learn"):
+        yield (
+            at,
+            "`learned` is the model of the `learn` section, and there is none; add it or name a folder",
+        )
+
+
+def _controller(
+    at: KeyPath, nmpc: Nmpc, states: dict[str, Variable] | None, inputs: list[str] | None
+) -> Iterator[Finding]:
+    """Settings that do not fit the model's states and inputs (None where these are not known)."""
+    for key, bounds in (("inputs", nmpc.inputs), ("states", nmpc.states)):
+        for name, bound in bounds.items():
+            if bound.min is not None and bound.max is not None and not bound.min < bound.max:
+                yield (*at, key, name), f"expected min < max, found min {bound.min:g} and max {bound.max:g}"
+    for name, value in nmpc.safe_input.items():
+        limits = nmpc.inputs.get(name, Bounds())
+        low = -math.inf if limits.min is None else limits.min
+        high = math.inf if limits.max is None else limits.max
+        if not low <= value <= high:
+            yield (*at, "safe_input", name), f"expected {low:g} … {high:g} (its bounds), found {value:g}"
+    if states is None or inputs is None:
+        return
+    weights = nmpc.weights
+    yield from _unknown((*at, "states"), nmpc.states, states, "states")
+    yield from _unknown((*at, "inputs"), nmpc.inputs, inputs, "inputs")
+    yield from _unknown((*at, "safe_input"), nmpc.safe_input, inputs, "inputs")
+    for key, known in (("states", list(states)), ("inputs", inputs)):
+        given = getattr(weights, key)
+        if isinstance(given, dict):
+            yield from _unknown((*at, "weights", key), given, known, key)
+    reference = nmpc.reference
+    yield from _unknown((*at, "reference", "coordinate"), [reference.coordinate], states, "states")
+    state, unit = states.get(reference.coordinate), reference.trajectory.unit
+    if state is not None and reference.through is None and not same_unit(unit, state.unit):
+        message = f"unit mismatch: trajectory [{unit}] → {state.name} [{state.unit}]"
+        yield (*at, "reference", "trajectory"), f"{message}; give the kinematics as `through`"
+
+
+def _unknown(at: KeyPath, given: Iterable[str], known: Iterable[str], kind: str) -> Iterator[Finding]:
+    """Names that the model does not have."""
+    names = list(known)
+    for name in given:
+        if name not in names:
+            where = at if at[-1] == "coordinate" else (*at, name)
+            yield (
+                where,
+                f"the model has no {kind.removesuffix('s')} {name!r}{suggestion(name, names, f'its {kind}')}",
+            )

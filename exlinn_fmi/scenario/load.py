@@ -1,0 +1,163 @@
+"""Scenario files: read, override, check. All mistakes are reported at once, before anything runs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from exlinn_fmi.errors import Problem, ScenarioError
+from exlinn_fmi.scenario import check_graph, check_learn
+from exlinn_fmi.scenario.document import Document, parse
+from exlinn_fmi.scenario.editor import json_schema
+from exlinn_fmi.scenario.explain import Finding, schema_findings
+from exlinn_fmi.scenario.overrides import apply
+from exlinn_fmi.scenario.schema import (
+    FmuComponent,
+    ModelComponent,
+    NmpcComponent,
+    PythonComponentSpec,
+    Scenario,
+    Table,
+)
+from exlinn_fmi.scenario.survey import Inspect, survey
+from exlinn_fmi.scenario.words import KeyPath, key_path, missing_file
+
+__all__ = ["Inspect", "LoadedScenario", "json_schema", "load_scenario", "named_files"]
+
+CHECKS = (
+    check_graph.connections,
+    check_graph.start_values,
+    check_graph.steps,
+    check_graph.recorded,
+    check_learn.signals,
+    check_learn.learning,
+    check_learn.control,
+)
+
+
+@dataclass(frozen=True)
+class LoadedScenario:
+    """A scenario that was read and checked.
+
+    Args:
+        scenario: what it says.
+        file: the file it was read from.
+        folder: the folder that its relative paths start from.
+        text: the scenario as run: the file's text, with overrides written in.
+    """
+
+    scenario: Scenario
+    file: Path
+    folder: Path
+    text: str
+    _lines: dict[str, int] = field(repr=False, compare=False)
+
+    def line(self, path: str) -> int:
+        """Line in the file of a key path such as ``learn.training[0].duration``, 0 where it has none."""
+        return self._lines.get(re.sub(r"\.(\d+)(?=[.\[]|$)", r"[\1]", path), 0)
+
+
+def load_scenario(
+    path: Path | str, overrides: Sequence[str] = (), inspect: Inspect | None = None
+) -> LoadedScenario:
+    """Read a scenario file and check it.
+
+    Args:
+        path: the file, YAML 1.2.
+        overrides: ``key.path=value`` each, e.g. ``simulate.stop=5`` or ``learn.training[0].duration=2``.
+        inspect: finds the variables of a component without running it, for the checks of their use.
+
+    Raises:
+        ScenarioError: with every mistake in the file and the overrides.
+    """
+    file = Path(path)
+    text = _read(file)
+    document = parse(text)
+    problems = list(document.problems)
+    if document.data is None and not problems:
+        problems.append(Problem("", "the file is empty; a scenario has at least `name` and `components`"))
+    applied: dict[KeyPath, str] = {}
+    data: Any = document.data
+    if overrides and isinstance(data, dict) and not problems:
+        text, applied, misfits = apply(text, overrides)
+        problems += misfits
+        data = parse(text).data
+    if data is not None:
+        findings = schema_findings(data, document.faulty)
+        known, more = survey(data, file.parent, inspect)
+        findings += more
+        for check in CHECKS:
+            findings += check(known)
+        problems += [_problem(finding, document, applied) for finding in dict.fromkeys(findings)]
+    if problems:
+        raise ScenarioError(str(file), list(dict.fromkeys(problems)))
+    lines = {key_path(at): line for at, line in document.lines.items()}
+    return LoadedScenario(Scenario.model_validate(data), file, file.parent, text, lines)
+
+
+def _read(file: Path) -> str:
+    """The text of a file.
+
+    Raises:
+        ScenarioError: there is none, or it is no text.
+    """
+    try:
+        return file.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise ScenarioError(str(file), [Problem("", missing_file(file.name, file.parent))]) from None
+    except UnicodeDecodeError as error:
+        line = error.object.count(b"\n", 0, error.start) + 1
+        raise ScenarioError(str(file), [Problem("", "not UTF-8 text; save it as UTF-8", line)]) from None
+    except OSError as error:
+        raise ScenarioError(str(file), [Problem("", f"cannot be read: {error.strerror}")]) from None
+
+
+def _problem(finding: Finding, document: Document, applied: dict[KeyPath, str]) -> Problem:
+    """A finding with its line, or with the override that it comes from."""
+    at, message = finding
+    for path, override in applied.items():
+        if at[: len(path)] == path:
+            return Problem(key_path(at), f"{message} (override {override!r})")
+    return Problem(key_path(at), message, document.line(at))
+
+
+def named_files(*sections: object, folder: Path | None = None) -> list[str]:
+    """Names of the files that sections of a scenario name, relative to its folder, each once.
+
+    Args:
+        sections: sections, or lists of them.
+        folder: the scenario's folder; with it the Python modules that lie there count as well.
+    """
+    return list(dict.fromkeys(name for section in sections for name in _named(section, folder)))
+
+
+def _named(section: object, folder: Path | None) -> Iterator[str]:
+    if isinstance(section, FmuComponent):
+        yield section.fmu
+    elif isinstance(section, Table):
+        yield section.file
+    elif isinstance(section, PythonComponentSpec):
+        module = section.python.split(":")[0].replace(".", "/") + ".py"
+        if folder is not None and (folder / module).is_file():
+            yield module
+    elif isinstance(section, ModelComponent):
+        yield from _model_files(section.model)
+    elif isinstance(section, NmpcComponent):
+        yield from _model_files(section.nmpc.model)
+    members: Any = vars(section).values() if isinstance(section, BaseModel) else section
+    if isinstance(members, dict):
+        members = members.values()
+    if not isinstance(members, str | bytes) and hasattr(members, "__iter__"):
+        for member in members:
+            yield from _named(member, folder)
+
+
+def _model_files(model: str) -> tuple[str, ...]:
+    if model == "learned" or model.startswith("plant:"):
+        return ()
+    return f"{model}/model.json", f"{model}/model.safetensors"

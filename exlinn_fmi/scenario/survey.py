@@ -1,0 +1,164 @@
+"""What the checks across sections know: the sound part of a scenario and the variables of its components."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from exlinn_fmi.components.base import Variable
+from exlinn_fmi.errors import InputError, ModelError
+from exlinn_fmi.mechanics.coordinates import Coordinate, check_coordinates
+from exlinn_fmi.scenario.derived import derived_variables
+from exlinn_fmi.scenario.explain import Finding, Sound, sound_part
+from exlinn_fmi.scenario.schema import (
+    ComponentBase,
+    FmuComponent,
+    ModelComponent,
+    NmpcComponent,
+    PythonComponentSpec,
+    Scenario,
+    component_kind,
+)
+from exlinn_fmi.scenario.words import KeyPath, closest, listing, missing_file, suggestion
+
+Inspect = Callable[[ComponentBase, Path], Sequence[Variable]]
+"""Finds the variables of a component without running it; raises `InputError` where it cannot be made."""
+
+Role = Literal["output", "input"]
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What is known of a scenario before anything is run.
+
+    Args:
+        sound: the part of it without mistakes.
+        folder: its folder.
+        names: all its components, those with mistakes as well.
+        coordinates: the coordinates that it learns; none where there is a mistake in them.
+        variables: by component and name, for the components whose variables are known.
+    """
+
+    sound: Sound
+    folder: Path
+    names: tuple[str, ...]
+    coordinates: tuple[Coordinate, ...]
+    variables: Mapping[str, Mapping[str, Variable]]
+
+    @property
+    def scenario(self) -> Scenario:
+        """The part of the scenario without mistakes."""
+        return self.sound.scenario
+
+    def find(self, path: str, role: Role) -> tuple[Variable | None, str | None]:
+        """The variable that ``component.variable`` names.
+
+        Args:
+            path: the name.
+            role: what it should be, for the names that a message offers.
+
+        Returns:
+            The variable, None where it is not known; and what is wrong with the name, None where nothing is.
+        """
+        component, name = path.split(".", 1)
+        if component not in self.names:
+            if self.sound.in_doubt((), "components"):
+                return None, None
+            return (
+                None,
+                f"there is no component {component!r}{suggestion(component, self.names, 'components')}",
+            )
+        known = self.variables.get(component)
+        if known is None or name in known:
+            return (known or {}).get(name), None
+        fitting = [v.name for v in known.values() if v.causality == role]
+        match = closest(name, fitting) or closest(name, known)
+        hint = f"; did you mean {match!r}?" if match else listing(fitting, f"its {role}s")
+        return None, f"{component} has no variable {name!r}{hint}"
+
+
+def survey(data: Any, folder: Path, inspect: Inspect | None) -> tuple[Survey, list[Finding]]:
+    """Gather what the checks need, and what is wrong with single components.
+
+    Args:
+        data: the scenario as plain data.
+        folder: its folder.
+        inspect: finds the variables of a component; without it those of FMUs, plants … stay unknown.
+    """
+    sound = sound_part(data)
+    components = data.get("components") if isinstance(data, dict) else None
+    names = tuple(components) if isinstance(components, dict) else ()
+    coordinates, findings = _coordinates(sound)
+    variables: dict[str, dict[str, Variable]] = {}
+    for name, spec in sound.scenario.components.items():
+        found: Sequence[Variable] | None = derived_variables(spec, coordinates)
+        problems = list(_files(name, spec, folder))
+        findings += problems
+        if found is None and not problems and inspect is not None and _settled(name, spec, sound):
+            try:
+                found = inspect(spec, folder)
+            except InputError as error:
+                message = "; ".join(str(error).splitlines())
+                findings.append((("components", name, component_kind(spec) or ""), message))
+        if found is not None:
+            variables[name] = {v.name: v for v in found}
+    return Survey(sound, folder, names, coordinates, variables), findings
+
+
+def _coordinates(sound: Sound) -> tuple[tuple[Coordinate, ...], list[Finding]]:
+    """The coordinates to learn, unless a mistake in them leaves open what they are."""
+    learn, at = sound.scenario.learn, ("learn", "coordinates")
+    if learn is None or any(path[:2] == at for path in sound.cut):
+        return (), []
+    findings: list[Finding] = [
+        (
+            (*at, k),
+            f"missing key 'position': the plant variable that is {c.name}; only a cyclic coordinate has none",
+        )
+        for k, c in enumerate(learn.coordinates)
+        if c.position is None and c.topology != "cyclic"
+    ]
+    coordinates = tuple(c.coordinate() for c in learn.coordinates)
+    try:
+        check_coordinates(coordinates)
+    except ModelError as error:
+        findings.append((at, str(error)))
+    return (() if findings else coordinates), findings
+
+
+def _settled(name: str, spec: ComponentBase, sound: Sound) -> bool:
+    """Whether a component is given well enough to look at, and needs no model that is still to be learned."""
+    at: KeyPath = ("components", name)
+    if isinstance(spec, NmpcComponent):
+        return spec.nmpc.model != "learned" and not any(path[:2] == at for path in sound.cut)
+    if isinstance(spec, PythonComponentSpec):
+        return not sound.in_doubt(at, "options")
+    return not isinstance(spec, ModelComponent) or spec.model != "learned"
+
+
+def _files(name: str, spec: ComponentBase, folder: Path) -> Iterator[Finding]:
+    """Files and folders that a component names and that are not there."""
+    at: KeyPath = ("components", name)
+    if isinstance(spec, FmuComponent) and not (folder / spec.fmu).is_file():
+        is_folder = (folder / spec.fmu).is_dir()
+        message = (
+            f"{spec.fmu!r} is a folder, expected an .fmu file"
+            if is_folder
+            else missing_file(spec.fmu, folder)
+        )
+        yield (*at, "fmu"), message
+    if isinstance(spec, ModelComponent):
+        yield from _model(spec.model, (*at, "model"), folder)
+    if isinstance(spec, NmpcComponent) and not spec.nmpc.model.startswith("plant:"):
+        yield from _model(spec.nmpc.model, (*at, "nmpc", "model"), folder)
+
+
+def _model(name: str, at: KeyPath, folder: Path) -> Iterator[Finding]:
+    if name == "learned" or (folder / name / "model.json").is_file():
+        return
+    if (folder / name).is_dir():
+        yield at, f"no model in {name!r}: it has no model.json; give a folder that `exlinn train` wrote"
+    else:
+        yield at, f"expected `learned` or a folder with a model.json; {missing_file(name, folder)}"
