@@ -117,7 +117,7 @@ def find_compiler(compiler: str | None = None) -> list[str]:
 
 
 def _compile(members: Mapping[str, bytes], binary: str, compiler: list[str]) -> bytes:
-    """Compile the sources to a shared library; relative paths keep this machine's folders out of it.
+    """Compile the sources to a shared library that holds no path of this machine, debug information included.
 
     Raises:
         RunError: with what the compiler said.
@@ -126,7 +126,17 @@ def _compile(members: Mapping[str, bytes], binary: str, compiler: list[str]) -> 
         for name, content in members.items():
             if name.startswith("sources/"):
                 (Path(folder) / Path(name).name).write_bytes(content)
-        command = [*compiler, *FLAGS, *PLATFORM_FLAGS.get(sys.platform, ()), SOURCE, "-o", binary, "-lm"]
+        here = f"-ffile-prefix-map={folder}=."
+        command = [
+            *compiler,
+            *FLAGS,
+            *PLATFORM_FLAGS.get(sys.platform, ()),
+            here,
+            SOURCE,
+            "-o",
+            binary,
+            "-lm",
+        ]
         result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if result.returncode:
             said = (result.stderr or result.stdout).strip()[:4000]
