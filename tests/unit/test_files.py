@@ -249,21 +249,6 @@ def test_stand_in_that_cannot_be_removed_hides_no_error(tmp_path: Path, monkeypa
         files.write_text(tmp_path / "f.txt", "")
 
 
-@pytest.fixture
-def tiny_disk(tmp_path: Path):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(disk)]
-    try:
-        mounted = subprocess.run(command, capture_output=True, check=False).returncode == 0
-    except OSError:
-        mounted = False
-    if not mounted:
-        pytest.skip("mounting a small disk needs root on Linux")
-    yield disk
-    subprocess.run(["umount", str(disk)], check=True)
-
-
 def test_full_disk_keeps_the_old_table_whole(tiny_disk: Path):
     files.write_table(tiny_disk / "t", frame_of([1.0]), {"time": "s"})
     before = {f.name: f.read_bytes() for f in tiny_disk.iterdir()}
