@@ -60,7 +60,7 @@ def export_system(
 ) -> Path:
     """Build any extended Lagrangian system, a learned one for instance, as an FMU.
 
-    Outputs are the states, the accelerations and the stored energy E.
+    Outputs are the states, the accelerations and the stored energy, named ``energy``.
 
     Args:
         system: the equations of motion.

@@ -7,7 +7,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.mechanics.coordinates import state_units
-from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
+from exlinn_fmi.mechanics.euler_lagrange import MAX_INTERNAL_STEP, LagrangianSystem, evaluate
 from exlinn_fmi.mechanics.plant import Plant
 
 SOLVER_STEP = "solver_step"
@@ -110,8 +109,8 @@ class StateSpaceModel:
     def solver_step(self) -> float:
         """Longest internal step h [s]: |λ| h ≤ 0.01 for every pole λ at the start state, rounded down.
 
-        The classical Runge–Kutta method then errs by less than 1e-10 of the state per time constant. Slower
-        models get 10 ms.
+        The classical Runge–Kutta method then errs by less than 1e-10 of the state per time constant. Never
+        longer than in-process components take, so that slow models run alike in both.
 
         Raises:
             ModelError: ẋ is not finite at the start state.
@@ -128,7 +127,7 @@ class StateSpaceModel:
                 "check the parameters and the start values"
             )
         fastest = float(np.max(np.abs(np.linalg.eigvals(poles))))
-        return _round_down(min(0.01, 0.01 / fastest if fastest > 0 else 0.01))
+        return _round_down(min(MAX_INTERNAL_STEP, 0.01 / fastest if fastest > 0 else MAX_INTERNAL_STEP))
 
 
 def plant_model(plant: Plant) -> StateSpaceModel:
@@ -138,16 +137,9 @@ def plant_model(plant: Plant) -> StateSpaceModel:
         plant: one of `exlinn_fmi.plants`.
     """
     system = plant.system
-    own = slice(len(system.state_names) + system.n, None)
-    outputs = tuple(Quantity(o.name, o.unit, o.description) for o in plant.output_list[own])
-    return _model(
-        system,
-        plant.model_name,
-        plant.description,
-        plant.start,
-        outputs,
-        lambda x, u, p: plant.output(x, u, p)[own],
-    )
+    own = plant.output_list[len(system.state_names) + system.n :]
+    outputs = tuple(Quantity(o.name, o.unit, o.description) for o in own)
+    return _model(system, plant.model_name, plant.description, plant.start, outputs, plant.output)
 
 
 def system_model(
@@ -161,13 +153,8 @@ def system_model(
         description: one line.
         start: initial state by name, 0 where not given.
     """
-
-    def energy(x: Any, u: Any, p: Any) -> Any:
-        q, v = system.split_state(x)
-        return system.energy(q, v, p)
-
-    output = Quantity("E", "J", "stored energy")
-    return _model(system, identifier, description, start or {}, (output,), energy)
+    energy = Quantity("energy", "J", "stored energy")
+    return _model(system, identifier, description, start or {}, (energy,), system.output)
 
 
 def _model(
@@ -176,9 +163,12 @@ def _model(
     description: str,
     start: Mapping[str, float],
     outputs: tuple[Quantity, ...],
-    output: Any,
+    output: ca.Function,
 ) -> StateSpaceModel:
-    """Name the variables of a system and put its equations in one function of one column."""
+    """Name the variables of a system and put its equations in one function of one column.
+
+    `output` gives states, accelerations and then `outputs`.
+    """
     kept = [c for c in system.coordinates if c.topology != "cyclic"]
     units = state_units(system.coordinates)
     texts = [f"generalised coordinate, {c.kind}" for c in kept]
@@ -204,7 +194,8 @@ def _model(
     n, m = len(states), len(inputs)
     z = ca.SX.sym("z", n + m + len(parameters))
     x, u, p = z[:n], z[n : n + m], z[n + m :]
-    unknown = ca.densify(ca.vertcat(system.derivative(x, u, p), output(x, u, p)))
+    y = output(x, u, p)[n + system.n :]
+    unknown = ca.densify(ca.vertcat(system.derivative(x, u, p), y))
     equations = ca.Function("equations", [z], [ca.cse(unknown)], ["z"], ["unknown"])
     return StateSpaceModel(
         identifier, description, states, inputs, parameters, derivatives, outputs, equations

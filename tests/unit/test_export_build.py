@@ -64,10 +64,10 @@ def test_the_binary_names_no_folder_of_the_machine_that_built_it(tmp_path: Path)
 def test_a_system_without_inputs_and_parameters_runs_and_keeps_its_energy(tmp_path: Path) -> None:
     with instance(export_system(PENDULUM, tmp_path, name="Pendulum", start={"theta": 2.0})) as made:
         made.start()
-        (before,) = made.get("E")
+        (before,) = made.get("energy")
         for k in range(100):
             made.fmu.doStep(k * 0.01, 0.01)
-        assert made.get("E")[0] == pytest.approx(before, abs=1e-9)
+        assert made.get("energy")[0] == pytest.approx(before, abs=1e-9)
         assert made.get("theta")[0] != 2.0
 
 

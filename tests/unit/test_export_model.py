@@ -66,7 +66,15 @@ def test_a_plants_outputs_are_states_accelerations_and_its_own() -> None:
 
 def test_any_system_exports_with_its_energy_as_output() -> None:
     model = system_model(oscillator(), "Oscillator", start={"s": 0.5})
-    assert [q.name for q in model.variables] == ["s", "s_dot", "f", "solver_step", "der(s)", "s_ddot", "E"]
+    assert [q.name for q in model.variables] == [
+        "s",
+        "s_dot",
+        "f",
+        "solver_step",
+        "der(s)",
+        "s_ddot",
+        "energy",
+    ]
     assert [q.start for q in model.states] == [0.5, 0.0]
     np.testing.assert_allclose(evaluate(model.equations, [0.5, 2.0, 1.0])[0], [2.0, 1.0 - 2.0 - 0.2, 2.5])
 
@@ -79,7 +87,7 @@ def test_solver_step_of_the_case_study_is_a_millisecond() -> None:
     assert MODEL.solver_step == 1e-3
 
 
-@pytest.mark.parametrize(("stiffness", "step"), [(1e12, 1e-8), (4e4, 5e-5), (4.0, 5e-3), (1e-4, 1e-2)])
+@pytest.mark.parametrize(("stiffness", "step"), [(1e12, 1e-8), (4e4, 5e-5), (4.0, 1e-3)])
 def test_solver_step_follows_the_fastest_pole(stiffness: float, step: float) -> None:
     assert system_model(oscillator(stiffness), "Oscillator").solver_step == step
 

@@ -85,8 +85,8 @@ static void runge_kutta(double *known, double dt)
  * Returns -1, or the index of the first state that is not finite any more: then the model stays where it was. */
 static int advance(State *s, double h)
 {
-    /* The small number keeps 0.01 / 0.001 = 10.000000000000002 from becoming eleven steps. */
-    const double ratio = ceil(h / s->values[SOLVER_STEP] - 1e-6);
+    /* A billionth is forgiven, so that 10 ms are ten steps of 1 ms whatever the rounding. */
+    const double ratio = ceil(h / s->values[SOLVER_STEP] - 1e-9);
     const double steps = ratio > 1.0 ? ratio : 1.0;
     double known[N_KNOWN];
 
