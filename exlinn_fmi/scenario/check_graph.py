@@ -128,34 +128,42 @@ def recorded(survey: Survey) -> Iterator[Finding]:
             yield ("simulate", "record", k), problem
     metrics = survey.scenario.metrics
     if simulate is not None and metrics.settle >= simulate.stop - simulate.start > 0:
-        span = simulate.stop - simulate.start
-        yield (
-            ("metrics", "settle"),
-            f"leaves nothing to judge: expected < {span:g} (the run), found {metrics.settle:g}",
+        message = (
+            f"expected < {simulate.stop - simulate.start:g} (the length of the run), found {metrics.settle:g}"
         )
+        yield ("metrics", "settle"), message
     if metrics.output is not None:
-        _, problem = survey.find(metrics.output, "output")
-        if problem is None and simulate is not None and not any(matches(metrics.output, p) for p in patterns):
-            problem = f"{metrics.output} is not recorded; add it to simulate.record"
+        variable, problem = survey.find(metrics.output, "output")
+        if simulate is not None and variable is not None:
+            recorded = any(records(pattern, metrics.output, variable) for pattern in patterns)
+            problem = None if recorded else f"{metrics.output} is not recorded; add it to simulate.record"
         if problem:
             yield ("metrics", "output"), problem
 
 
-def matches(path: str, pattern: str) -> bool:
-    """Whether a variable is meant by a name with the wildcards * and ?; brackets stand for themselves."""
-    return fnmatchcase(path, pattern.replace("[", "[[]"))
+def records(pattern: str, path: str, variable: Variable) -> bool:
+    """Whether a name to record stands for a variable, as the recorder of a run takes it.
+
+    ``*`` alone stands for inputs and outputs; another pattern for local variables as well; a name in full for
+    any variable. Brackets stand for themselves.
+    """
+    if pattern == path:
+        return True
+    kinds = ("input", "output") if pattern == "*" else ("input", "output", "local")
+    return variable.causality in kinds and fnmatchcase(path, pattern.replace("[", "[[]"))
 
 
 def _no_match(survey: Survey, pattern: str) -> str | None:
-    """Why a name to record means nothing, None where it means something or that is not known."""
+    """Why a name to record stands for nothing, None where it stands for something or that is not known."""
     if not any(wildcard in pattern for wildcard in "*?"):
         if "." not in pattern:
-            return f"expected component.variable or a pattern such as {pattern}.*, found {pattern!r}"
+            return f"expected component.variable or a pattern such as '*' or 'plant.*', found {pattern!r}"
         return survey.find(pattern, "output")[1]
-    if any(matches(f"{name}.{v}", pattern) for name, known in survey.variables.items() for v in known):
+    known = ((f"{name}.{v.name}", v) for name, all_ in survey.variables.items() for v in all_.values())
+    if pattern == "*" or any(records(pattern, path, variable) for path, variable in known):
         return None
     component = pattern.split(".", 1)[0]
     unknown = [name for name in survey.names if name not in survey.variables]
-    if any(matches(name, component) for name in unknown) or survey.sound.in_doubt((), "components"):
+    if any(fnmatchcase(name, component) for name in unknown) or survey.sound.in_doubt((), "components"):
         return None
-    return f"{pattern!r} matches no variable; components: {', '.join(survey.names)}"
+    return f"nothing fits {pattern!r}; components: {', '.join(survey.names)}"
