@@ -114,7 +114,7 @@ class StorageError(RunError):
     """A result could not be written (disk full, no permission, …)."""
 
 
-class Interrupted(RunError):
+class Interrupted(RunError):  # noqa: N818 - the user's wish, not an error
     """The user stopped the run; what was finished until then is on disk."""
 
 

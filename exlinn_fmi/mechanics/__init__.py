@@ -1,1 +1,1 @@
-"""The extended Lagrangian core: coordinates, Euler–Lagrange equations, plants and learned models as systems."""
+"""The extended Lagrangian core: coordinates, equations of motion, plants and learned models."""

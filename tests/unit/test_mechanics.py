@@ -47,7 +47,9 @@ def test_inverse_of_forward_is_identity(n: int, seed: int) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(n=st.integers(1, 4), seed=st.integers(0, 10_000))
-def test_mass_matrix_is_symmetric_and_positive_definite_where_the_lagrangian_says_so(n: int, seed: int) -> None:
+def test_mass_matrix_is_symmetric_and_positive_definite_where_the_lagrangian_says_so(
+    n: int, seed: int
+) -> None:
     q, v = np.random.default_rng(seed).normal(size=(2, 5, n))
     mass = evaluate(random_system(n, seed).mass_matrix, q, v, np.empty(0)).reshape(5, n, n)
     np.testing.assert_allclose(mass, mass.transpose(0, 2, 1), atol=1e-12)
@@ -60,15 +62,19 @@ def test_equations_of_motion_19_follow_symbolically_from_18() -> None:
     alpha, charge = sympy.Function("alpha")(t), sympy.Function("Q")(t)
     s = [sympy.symbols(x) for x in ("al", "w", "i", "dw", "di")]
     w, i = alpha.diff(t), charge.diff(t)
-    lagrangian = j * w**2 / 2 + m * (d * sympy.sin(alpha) * w) ** 2 / 2 + inductance * i**2 / 2 + k * i * alpha
+    lagrangian = (
+        j * w**2 / 2 + m * (d * sympy.sin(alpha) * w) ** 2 / 2 + inductance * i**2 / 2 + k * i * alpha
+    )
     dissipation = b * w**2 / 2 + r * i**2 / 2
     names = {w.diff(t): s[3], i.diff(t): s[4], w: s[1], i: s[2], alpha: s[0]}
     for row, (x, velocity) in enumerate(((alpha, w), (charge, i))):
         equation = lagrangian.diff(velocity).diff(t) - lagrangian.diff(x) + dissipation.diff(velocity)
         equation = equation.doit().subs(names)
-        mechanical = (j + m * d**2 * sympy.sin(s[0]) ** 2) * s[3] + (
-            b + m * d**2 * sympy.sin(s[0]) * sympy.cos(s[0]) * s[1]
-        ) * s[1] - k * s[2]
+        mechanical = (
+            (j + m * d**2 * sympy.sin(s[0]) ** 2) * s[3]
+            + (b + m * d**2 * sympy.sin(s[0]) * sympy.cos(s[0]) * s[1]) * s[1]
+            - k * s[2]
+        )
         electrical = inductance * s[4] + r * s[2] + k * s[1]
         assert sympy.simplify(equation - (mechanical, electrical)[row]) == 0
 
@@ -79,7 +85,11 @@ def test_plant_page_gives_the_equations_of_motion_19() -> None:
     force = evaluate(DCWC.system.inverse, q, v, a, P)
     s, c = np.sin(q[:, 0]), np.cos(q[:, 0])
     cart = p["m_c"] * p["d"] ** 2
-    row1 = (p["j_m"] + cart * s**2) * a[:, 0] + (p["b_m"] + cart * s * c * v[:, 0]) * v[:, 0] - p["k_e"] * v[:, 1]
+    row1 = (
+        (p["j_m"] + cart * s**2) * a[:, 0]
+        + (p["b_m"] + cart * s * c * v[:, 0]) * v[:, 0]
+        - p["k_e"] * v[:, 1]
+    )
     row2 = p["l"] * a[:, 1] + p["r"] * v[:, 1] + p["k_e"] * v[:, 0]
     np.testing.assert_allclose(force, np.stack([row1, row2], 1), atol=1e-13)
 
@@ -95,7 +105,8 @@ def test_power_balance_holds_at_every_point(n: int, seed: int) -> None:
     q, v, u = np.random.default_rng(seed).normal(size=(3, 6, n))
     a, h = evaluate(system.forward, q, v, u, none), 1e-5
     rate = (
-        evaluate(system.energy, q + h * v, v + h * a, none) - evaluate(system.energy, q - h * v, v - h * a, none)
+        evaluate(system.energy, q + h * v, v + h * a, none)
+        - evaluate(system.energy, q - h * v, v - h * a, none)
     ) / (2 * h)
     supplied = np.sum(v * u, 1, keepdims=True)
     loss = np.array([float(system.power(v[k], u[k], none)[1]) for k in range(6)])[:, None]

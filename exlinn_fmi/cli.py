@@ -1,0 +1,301 @@
+"""The command `exlinn`: arguments, progress and exit codes, nothing else."""
+
+from __future__ import annotations
+
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from exlinn_fmi.errors import ExlinnError, InputError, Interrupted, StorageError
+
+if TYPE_CHECKING:
+    from exlinn_fmi.pipeline import Run
+
+# Typer brings its own copy of click from 0.26 on: the base of its usage errors is found either way.
+UsageError: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
+
+app = typer.Typer(
+    name="exlinn",
+    help="Learn a physics-faithful model of a plant, control it with NMPC, run both in co-simulation.\n\n"
+    "Example: exlinn run scenarios/dcwc_tracking.yaml",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+ScenarioFile = Annotated[Path, typer.Argument(help="Scenario file (YAML).", metavar="SCENARIO")]
+Out = Annotated[Path | None, typer.Option("--out", help="Run folder; runs/<scenario name> if not given.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY.PATH=VALUE", help="Set a value of the scenario; may be given often."),
+]
+
+
+class Terminal:
+    """Shows progress on stderr: a bar on a terminal, plain lines of stages elsewhere."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        self.console = Console(stderr=True, highlight=False, soft_wrap=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        self.progress = Progress(
+            *columns, TextColumn("{task.fields[text]}"), console=self.console, transient=True
+        )
+        self.task: Any = None
+
+    def stage(self, name: str, detail: str) -> None:
+        """A stage begins."""
+        self.close()
+        self.console.print(f"[bold]{name:<9}[/] {detail}", markup=True)
+        if self.console.is_terminal:
+            self.progress.start()
+            self.task = self.progress.add_task(name, total=1.0, text="")
+
+    def update(self, fraction: float, text: str = "") -> None:
+        """The present stage is that far."""
+        if self.task is not None:
+            self.progress.update(self.task, completed=fraction, text=text)
+
+    def note(self, text: str) -> None:
+        """Something that the user should know."""
+        self.console.print(f"warning: {text}", markup=False)
+
+    def close(self) -> None:
+        """Take the bar away."""
+        if self.task is not None:
+            self.progress.remove_task(self.task)
+            self.progress.stop()
+            self.task = None
+
+
+def perform(work: Callable[[Run], object], file: Path, out: Path | None, overrides: list[str] | None) -> Run:
+    """Do some work on a scenario, with progress shown and Ctrl-C minded."""
+    from exlinn_fmi.pipeline import Run
+
+    terminal = Terminal()
+    try:
+        run = Run.open(file, out, overrides or (), terminal)
+        with run.stop:
+            work(run)
+    finally:
+        terminal.close()
+    return run
+
+
+@app.command()
+def run(scenario: ScenarioFile, out: Out = None, overrides: Overrides = None) -> None:
+    """Do all that a scenario asks for: collect, train, simulate, report.
+
+    Example: exlinn run scenarios/dcwc_tracking.yaml --set simulate.stop=5
+    """
+    from exlinn_fmi import pipeline
+
+    began = time.perf_counter()
+    work = perform(pipeline.run, scenario, out, overrides)
+    show_metrics(work.folder)
+    typer.echo(f"\n{work.folder / 'report.html'}  ({time.perf_counter() - began:.1f} s)")
+
+
+@app.command()
+def validate(scenario: ScenarioFile, overrides: Overrides = None) -> None:
+    """Check a scenario and everything that it names, without running anything.
+
+    Example: exlinn validate scenarios/dcwc_paper.yaml
+    """
+    from exlinn_fmi.pipeline import Run
+
+    work = Run.open(scenario, None, overrides or ())
+    parts = f"{len(work.scenario.components)} components, {len(work.scenario.connection_list())} connections"
+    typer.echo(f"{scenario}: valid ({parts})")
+
+
+@app.command()
+def info(
+    target: Annotated[Path, typer.Argument(help="A scenario, an FMU or a run folder.", metavar="PATH")],
+    overrides: Overrides = None,
+) -> None:
+    """Tell what is in a scenario (order, delays), an FMU (variables) or a run folder (stages, metrics).
+
+    Example: exlinn info fmus/DCMotorCart.fmu
+    """
+    from exlinn_fmi.describe import describe
+
+    typer.echo(describe(target, overrides or ()))
+
+
+@app.command()
+def collect(scenario: ScenarioFile, out: Out = None, overrides: Overrides = None) -> None:
+    """Excite the plant and save the data set.
+
+    Example: exlinn collect scenarios/dcwc_tracking.yaml --out runs/data
+    """
+    from exlinn_fmi import pipeline
+
+    work = perform(pipeline.collect, scenario, out, overrides)
+    typer.echo(str(work.folder / "dataset.csv"))
+
+
+@app.command()
+def train(scenario: ScenarioFile, out: Out = None, overrides: Overrides = None) -> None:
+    """Train the model (on data collected as needed) and print its report card. Ctrl-C keeps the best so far.
+
+    Example: exlinn train scenarios/dcwc_tracking.yaml --set learn.method.hidden=6
+    """
+    from exlinn_fmi import pipeline
+
+    work = perform(pipeline.train, scenario, out, overrides)
+    show_metrics(work.folder, "learn.", "identify.")
+    typer.echo(f"\n{work.folder / 'model.safetensors'}")
+
+
+@app.command()
+def simulate(scenario: ScenarioFile, out: Out = None, overrides: Overrides = None) -> None:
+    """Run the scenario's components in co-simulation (learning first what they need).
+
+    Example: exlinn simulate scenarios/external_fmu.yaml --set components.fmu.fmu=/path/to/Plant.fmu
+    """
+    from exlinn_fmi import pipeline
+
+    work = perform(pipeline.simulate, scenario, out, overrides)
+    show_metrics(work.folder, "control.", "simulate.")
+    typer.echo(f"\n{work.folder / 'trajectories.csv'}")
+
+
+@app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(help="Run folder, e.g. runs/dcwc_tracking.", metavar="FOLDER")],
+) -> None:
+    """Make figures and report.html again from what is in a run folder.
+
+    Example: exlinn report runs/dcwc_tracking
+    """
+    from exlinn_fmi import pipeline
+
+    if not (folder / "scenario.yaml").exists():
+        raise InputError(
+            f"{folder}: not a run folder (it has no scenario.yaml); give one that `exlinn run` wrote"
+        )
+    typer.echo(str(pipeline.report(folder)))
+
+
+export_app = typer.Typer(
+    help="Write an FMU without Python inside.\n\nExample: exlinn export plant dc_motor_cart",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+app.add_typer(export_app, name="export")
+
+
+@export_app.command("plant")
+def export_plant_command(
+    name: Annotated[str, typer.Argument(help="Name of the plant, e.g. dc_motor_cart.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="FMU to write; <ModelName>.fmu if not given.")
+    ] = None,
+) -> None:
+    """Build a plant page as an FMU (FMI 2.0, Co-Simulation and Model Exchange). Needs a C compiler.
+
+    Example: exlinn export plant dc_motor_cart --out fmus/DCMotorCart.fmu
+    """
+    from exlinn_fmi.export.build import export_plant
+    from exlinn_fmi.plants import plant
+
+    page = plant(name)
+    typer.echo(str(export_plant(page, out or Path(f"{page.model_name}.fmu"))))
+
+
+@export_app.command("model")
+def export_model_command(
+    folder: Annotated[
+        Path, typer.Argument(help="Run folder, or any folder with model.json.", metavar="FOLDER")
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="FMU to write; <folder name>.fmu if not given.")
+    ] = None,
+) -> None:
+    """Build a learned model as an FMU (FMI 2.0, Co-Simulation and Model Exchange). Needs a C compiler.
+
+    Example: exlinn export model runs/dcwc_tracking --out Learned.fmu
+    """
+    from exlinn_fmi.export.build import export_system
+    from exlinn_fmi.factory import model_system
+
+    system = model_system(str(folder.resolve()), Path(), folder)
+    file = out or Path(f"{folder.resolve().name}.fmu")
+    typer.echo(
+        str(export_system(system, file, name=file.stem, description="learned extended Lagrangian model"))
+    )
+
+
+@app.command()
+def schema(
+    out: Annotated[
+        Path | None, typer.Option("--out", help="File to write; standard output if not given.")
+    ] = None,
+) -> None:
+    """Print the JSON Schema of scenario files, for editors.
+
+    Example: exlinn schema --out scenario.schema.json
+    """
+    import json
+
+    from exlinn_fmi.data.files import write_text
+    from exlinn_fmi.scenario.load import json_schema
+
+    text = json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"
+    if out is None:
+        typer.echo(text, nl=False)
+    else:
+        write_text(out, text)
+        typer.echo(str(out))
+
+
+def show_metrics(folder: Path, *prefixes: str) -> None:
+    """Print the metrics of a run folder, one a line."""
+    from exlinn_fmi.pipeline import metrics
+
+    values = {k: v for k, v in metrics(folder).items() if k.startswith(prefixes or ("",))}
+    width = max(map(len, values), default=0)
+    for name, value in values.items():
+        typer.echo(
+            f"{name:<{width}}  {value:.6g}" if isinstance(value, float) else f"{name:<{width}}  {value}"
+        )
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the console script: run a command and end with its exit code."""
+    sys.exit(exit_code(arguments))
+
+
+def exit_code(arguments: list[str] | None = None) -> int:
+    """Run a command; 0 done, 1 the user's input is at fault, 2 the run failed, 3 a bug."""
+    try:
+        app(arguments, standalone_mode=False)
+    except UsageError as error:
+        error.show()
+        return 1
+    except (KeyboardInterrupt, typer.Abort):
+        return fail(Interrupted("stopped at once by a second Ctrl-C; files that were complete are kept"))
+    except ExlinnError as error:
+        return fail(error)
+    except OSError as error:
+        return fail(StorageError(f"{error.filename or 'a file'}: {error.strerror or error}"))
+    except Exception:
+        traceback.print_exc()
+        typer.echo("This is a bug in exlinn; please report it with the text above.", err=True)
+        return 3
+    return 0
+
+
+def fail(error: ExlinnError) -> int:
+    """Print an error and give its exit code."""
+    typer.echo(f"error: {error}", err=True)
+    return error.exit_code

@@ -1,0 +1,95 @@
+"""What `exlinn info` says of a scenario, an FMU or a run folder, as plain text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from exlinn_fmi.components.base import Variable
+from exlinn_fmi.data.files import read_json
+from exlinn_fmi.errors import InputError
+
+
+def describe(target: Path, overrides: Sequence[str] = ()) -> str:
+    """Describe a file or folder by what it is.
+
+    Args:
+        target: a scenario file, an FMU or a run folder.
+        overrides: ``key.path=value`` texts for a scenario.
+
+    Raises:
+        InputError: it is none of these, or is at fault itself.
+    """
+    if target.is_dir():
+        return describe_run(target)
+    if not target.exists():
+        raise InputError(f"{target}: no such file or folder; give a scenario, an FMU or a run folder")
+    if target.suffix == ".fmu":
+        from exlinn_fmi.components.fmu import read_variables
+
+        return f"{target}\n" + describe_variables(read_variables(target))
+    return describe_scenario(target, overrides)
+
+
+def describe_variables(variables: Iterable[Variable]) -> str:
+    """Variables as a table: causality, name, unit, type, start, direct feed-through, description."""
+    rows = [("causality", "name", "unit", "type", "start", "depends on", "")]
+    for v in variables:
+        through = "" if v.causality != "output" else "?" if v.depends_on is None else " ".join(v.depends_on)
+        start = "" if v.start is None else f"{v.start:.9g}"
+        rows.append((v.causality, v.name, v.unit or "", v.type, start, through, v.description))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(f"{t:<{w}}" for t, w in zip(row, widths, strict=True)).rstrip() for row in rows
+    )
+
+
+def describe_scenario(file: Path, overrides: Sequence[str]) -> str:
+    """A scenario: its components in stepping order, connections, loops and delays, and what it will do.
+
+    A controller or model that is still to be learned is described without being made.
+    """
+    from exlinn_fmi.cosim.graph import Graph
+    from exlinn_fmi.factory import outline
+    from exlinn_fmi.pipeline import Run
+
+    work = Run.open(file, None, overrides)
+    components = {name: outline(name, work.scenario, work.loaded.folder) for name in work.scenario.components}
+    lines = [f"{work.scenario.name}: {work.scenario.description}".rstrip(": ")]
+    if work.scenario.learn:
+        learn = work.scenario.learn
+        names = ", ".join(c.name for c in learn.coordinates)
+        experiments = f"{len(learn.training)} training experiments, {len(learn.test)} tests"
+        lines.append(f"learns {learn.plant} in {names}: {experiments}")
+    lines.append(Graph(components, work.scenario.connection_list()).describe())
+    return "\n".join(lines)
+
+
+def describe_run(folder: Path) -> str:
+    """A run folder: its stages, metrics and files.
+
+    Raises:
+        InputError: the folder was not written by a run.
+    """
+    if not (folder / "scenario.yaml").exists():
+        raise InputError(
+            f"{folder}: not a run folder (it has no scenario.yaml); give one that `exlinn run` wrote"
+        )
+    lines = [str(folder)]
+    for title in ("stages", "metrics"):
+        file = folder / f"{title}.json"
+        lines.append(f"\n{title}")
+        for name, value in (read_json(file) if file.exists() else {}).items():
+            shown = (
+                f"done in {value['seconds']} s"
+                if title == "stages"
+                else f"{value:.6g}"
+                if isinstance(value, float)
+                else value
+            )
+            lines.append(f"  {name:<36} {shown}")
+    lines.append(
+        "\nfiles\n  "
+        + "\n  ".join(sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()))
+    )
+    return "\n".join(lines)
