@@ -32,7 +32,10 @@ class StopRequest:
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
-        print("\nStopping after the present step; what there is will be kept. Ctrl-C again ends at once.", file=sys.stderr)
+        print(
+            "\nStopping after the present step; what there is will be kept. Ctrl-C again ends at once.",
+            file=sys.stderr,
+        )
 
     def __enter__(self) -> StopRequest:
         # Signals can be handled in the main thread only; elsewhere the caller has its own ways.
