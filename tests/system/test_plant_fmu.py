@@ -17,6 +17,7 @@ from fmpy.fmi1 import FMICallException
 from fmpy.validation import validate_fmu
 from scipy.integrate import solve_ivp
 
+from exlinn_fmi.components.lagrangian import LagrangianComponent
 from exlinn_fmi.export import export_plant
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
 from exlinn_fmi.plants import plant
@@ -117,6 +118,22 @@ def test_ten_seconds_equal_dop853_under_a_constant_input(cs: Instance, h: float)
         atol=1e-13,
     )
     np.testing.assert_allclose(end[steps // 100 - 1 :: steps // 100], exact.y.T, rtol=0, atol=1e-8)
+
+
+def test_ten_seconds_equal_the_python_component(cs: Instance) -> None:
+    inputs = paper_input(1000, 0.01)
+    cs.start({**X0, "j_m": 0.15})
+    names = [o.name for o in PLANT.output_list]
+    component = LagrangianComponent("plant", PLANT)
+    component.enter_initialization(0.0, 10.0, {**X0, "j_m": 0.15})
+    component.exit_initialization()
+    asked, v = np.array([component.index(n) for n in names]), np.array([component.index("v")])
+    rows = np.zeros((1000, len(names)))
+    for k in range(1000):
+        component.set(v, inputs["v"][k : k + 1])
+        component.step(0.01 * k, 0.01)
+        component.get(asked, rows[k])
+    np.testing.assert_allclose(cs.run(names, 0.01, inputs), rows, rtol=0, atol=1e-9)
 
 
 def equations_19(_: float, x: np.ndarray, v: float) -> list[float]:
@@ -306,6 +323,17 @@ def test_model_exchange_derivatives_and_outputs_equal_the_plants(me: Instance) -
     assert list(dx) == [1.0, 1.0, 1.0]
     outputs = evaluate(PLANT.output, list(X0.values()), [0.0, 7.0], DEFAULTS)[0]
     np.testing.assert_allclose(me.get(*(o.name for o in PLANT.output_list)), outputs, rtol=1e-14)
+
+
+def test_casadi_reads_the_fmu_as_a_function_with_exact_derivatives(fmu: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(fmu) as archive:
+        archive.extractall(tmp_path)
+    ode = ca.DaeBuilder("plant", str(tmp_path)).create("ode", ["x", "u"], ["ode"])
+    x, u = list(X0.values()), [0.3, 7.0]
+    np.testing.assert_allclose(ode(x, u).full(), SYSTEM.derivative(x, u, DEFAULTS).full(), rtol=1e-14)
+    jacobian = SYSTEM.derivative.factory("jacobian", ["x", "u", "p"], ["jac:dx:x"])(x, u, DEFAULTS)
+    given = ode.factory("jacobian", ["x", "u"], ["jac:ode:x"])(x, u)
+    np.testing.assert_allclose(given.full(), jacobian.full(), rtol=1e-13, atol=1e-15)
 
 
 def test_model_exchange_has_no_events(me: Instance) -> None:

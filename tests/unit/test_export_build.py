@@ -10,6 +10,7 @@ import zipfile
 from pathlib import Path
 
 import casadi as ca
+import numpy as np
 import pytest
 from export_helpers import instance
 
@@ -19,6 +20,7 @@ from exlinn_fmi.export import export_plant, export_system
 from exlinn_fmi.export.build import find_compiler
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
+from exlinn_fmi.mechanics.learned import ModelSpec, Scales, learned_system
 from exlinn_fmi.plants import plant
 
 PLANT = plant("dc_motor_cart")
@@ -69,6 +71,20 @@ def test_a_system_without_inputs_and_parameters_runs_and_keeps_its_energy(tmp_pa
             made.fmu.doStep(k * 0.01, 0.01)
         assert made.get("energy")[0] == pytest.approx(before, abs=1e-9)
         assert made.get("theta")[0] != 2.0
+
+
+def test_a_learned_model_runs_as_in_python(tmp_path: Path) -> None:
+    scales = Scales(0.2, 1.0, (1.0, 0.5), (0.0, 0.0), (1.0, 1.0))
+    spec = ModelSpec("structured", PLANT.coordinates, 4, scales, (0.05, 0.05))
+    rng = np.random.default_rng(0)
+    system = learned_system(spec, {name: 0.3 * rng.normal(size=s) for name, s in spec.shapes().items()})
+    with instance(export_system(system, tmp_path, name="Learned", start={"alpha": 0.5})) as made:
+        made.start()
+        (h,) = made.get("solver_step")
+        states = made.run(system.state_names, h, {"v": np.full(200, 5.0)})
+    u = np.tile([[0.0], [5.0]], 200)
+    expected = system.rk4().mapaccum(200)([0.5, 0.0, 0.0], u, [], h).full().T
+    np.testing.assert_allclose(states, expected, rtol=0, atol=1e-12)
 
 
 def test_the_environments_compiler_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:

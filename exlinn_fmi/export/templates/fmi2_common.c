@@ -184,17 +184,18 @@ static fmi2Status unknown_reference(const Instance *s, const char *function, fmi
     return fail(s, "%s: there is no value reference %u, the last one is %d", function, r, N_VALUES - 1);
 }
 
-/* The modes in which a value may be set: initial states and solver_step before the start, parameters and inputs
- * also later on, derivatives and outputs never. */
+/* The modes in which a value may be set: solver_step and, where the model integrates itself, states before the start,
+ * inputs and parameters also later on, derivatives and outputs never. This is wider than the standard for Model
+ * Exchange, because CasADi, which reads FMUs as functions, sets states and parameters in continuous-time mode. */
 static int settable(fmi2ValueReference r)
 {
-    if (r < FIRST_U || r == SOLVER_STEP) {
-        return BEFORE_START;
+    if (r < FIRST_U) {
+        return BEFORE_START | EVENT | CONTINUOUS_TIME;
     }
-    if (r < FIRST_P) {
+    if (r < N_KNOWN) {
         return BEFORE_START | RUNNING;
     }
-    return r < N_KNOWN ? BEFORE_START | STEP | EVENT : 0;
+    return r == SOLVER_STEP ? BEFORE_START : 0;
 }
 
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2Real value[])
