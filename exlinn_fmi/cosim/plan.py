@@ -1,0 +1,361 @@
+"""The work at a communication point as plain array work: the signal vector and who reads and writes it.
+
+All values that are passed on or recorded live in one vector, `Plan.signals`, whose first entry is the time.
+Each visit of the graph owns two pieces of it, the inputs to set and the variables to get, so that a component
+reads and writes the vector itself, and a connection is part of one gather between pieces. Whoever steps in
+another way (compiled, with rollback, solving loops) finds all indices here.
+"""
+
+from __future__ import annotations
+
+import math
+import traceback
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+
+from exlinn_fmi.components.base import Component, Indices, Status, Values
+from exlinn_fmi.cosim.graph import Graph
+from exlinn_fmi.cosim.order import Port
+from exlinn_fmi.errors import ComponentError, InputError, RunError
+
+Call = Callable[[Indices, Values], Status]
+
+
+@dataclass(slots=True, frozen=True)
+class Exchange:
+    """Set some variables of a component, then get some.
+
+    Args:
+        component: its number.
+        set: its method.
+        inputs: variables to set; None where there are none.
+        sources: where their values are in the vector that they come from.
+        given: where they are put, in the order of `inputs`.
+        get: the component's method.
+        outputs: variables to get; None where there are none.
+        taken: where they are put.
+    """
+
+    component: int
+    set: Call
+    inputs: Indices | None
+    sources: Indices
+    given: Values
+    get: Call
+    outputs: Indices | None
+    taken: Values
+
+
+@dataclass(slots=True, frozen=True)
+class Advance:
+    """Step a component; with Gauss–Seidel, refresh its inputs before and read its outputs after.
+
+    Args:
+        component: its number.
+        every: its own step in ticks.
+        h: its own step [s].
+        step: its method.
+        before: takes new values of components already stepped.
+        after: gives new values to components that are still to be stepped.
+    """
+
+    component: int
+    every: int
+    h: float
+    step: Callable[[float, float], Status]
+    before: Exchange | None
+    after: Exchange | None
+
+
+@dataclass(slots=True)
+class Warned:
+    """WARNING statuses of a component: how many, and what the first one said."""
+
+    count: int
+    first: str
+
+
+class Plan:
+    """The work at each tick k, t = start + k · step, laid out before the run begins.
+
+    Args:
+        graph: components and connections.
+        components: the graph's components, possibly wrapped, in its order.
+        recorded: variables to record.
+        every: own step in ticks, by component number.
+        ticks: number of the last tick.
+        step: step of the master [s].
+        gauss_seidel: whether inputs are refreshed from components already stepped.
+
+    Attributes:
+        signals: the time, and the value of every variable that is passed on or recorded.
+        columns: where time and recorded variables are in `signals`.
+        warnings: by component name.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        components: Sequence[Component],
+        recorded: Sequence[Port],
+        every: Sequence[int],
+        ticks: int,
+        step: float,
+        gauss_seidel: bool,
+    ) -> None:
+        self.graph, self.components = graph, tuple(components)
+        self.warnings: dict[str, Warned] = {}
+        self._ticks = ticks
+        self._lay_out(recorded)
+        self._visits = [
+            (every[v.component], self._exchange_of(v.component, self.signals, given, taken))
+            for v, given, taken in self._pieces
+        ]
+        self._advances = self._plan_advances(every, step, gauss_seidel)
+
+    # ── layout ───────────────────────────────────────────────────────────────────────────────────────────
+
+    def _lay_out(self, recorded: Sequence[Port]) -> None:
+        """Give every variable its place in the signal vector."""
+        graph, places, size = self.graph, dict[Port, int](), 1
+
+        def piece(ports: Iterable[Port]) -> dict[Port, int]:
+            nonlocal size
+            new = {port: size + k for k, port in enumerate(ports)}
+            size += len(new)
+            return new
+
+        connected = {port for edge in graph.connections for port in edge}
+        moving = ("output", "local", "independent")
+        extra = [p for p in recorded if p not in connected and graph.variable(p).causality in moving]
+        self._pieces = []
+        for visit in graph.visits:
+            number = visit.component
+            given = piece((number, k) for k in visit.inputs)
+            also = [p for p in extra if visit.last and p[0] == number]
+            taken = piece([*((number, k) for k in visit.outputs), *also])
+            self._pieces.append((visit, given, taken))
+            places |= given | taken
+        still = [p for p in sorted(recorded) if p not in places]
+        constants = [piece(ports) for _, ports in groupby(still, key=lambda p: p[0])]
+        late = sorted({o for o, _ in graph.delayed})
+        held = [piece(ports) for _, ports in groupby(late, key=lambda p: p[0])]
+        for ports in constants:
+            places |= ports
+        holds = {port: place for ports in held for port, place in ports.items()}
+
+        self.signals: Values = np.zeros(size)
+        self.columns = _indices([0, *(places[p] for p in recorded)])
+        self._source = {i: (holds if (o, i) in graph.delayed else places)[o] for o, i in graph.connections}
+        self._constants = [self._exchange_of(_number(p), self.signals, {}, p) for p in constants]
+        self._before_first = [self._exchange_of(_number(p), self.signals, {}, p) for p in held]
+        self._hold_to = _indices(holds.values())
+        self._hold_from = _indices(places[port] for port in holds)
+
+    def _exchange_of(
+        self,
+        number: int,
+        vector: Values,
+        given: Mapping[Port, int],
+        taken: Mapping[Port, int],
+        source: Mapping[Port, int] | None = None,
+    ) -> Exchange:
+        """An exchange whose pieces lie in `vector`; the values to set come from the places `source`."""
+        source = self._source if source is None else source
+        component = self.components[number]
+        return Exchange(
+            number,
+            component.set,
+            _indices(k for _, k in given) if given else None,
+            _indices(source[port] for port in given),
+            vector[_span(given)],
+            component.get,
+            _indices(k for _, k in taken) if taken else None,
+            vector[_span(taken)],
+        )
+
+    def _plan_advances(self, every: Sequence[int], step: float, gauss_seidel: bool) -> list[Advance]:
+        """Steps in the graph's order.
+
+        With Gauss–Seidel, an input is refreshed if its source was stepped before and over the same time, and
+        neither of the two is sampled: sampled components hold what they gave and what they took.
+        """
+        graph = self.graph
+        numbers = [graph.names.index(name) for name in graph.order]
+        turn = {number: k for k, number in enumerate(numbers)}
+        fresh = {
+            i: o
+            for o, i in graph.connections
+            if gauss_seidel
+            and turn[o[0]] < turn[i[0]]
+            and every[o[0]] == every[i[0]]
+            and not (self.components[o[0]].sampled or self.components[i[0]].sampled)
+            and (o, i) not in graph.delayed
+        }
+        ports = [*sorted(set(fresh.values())), *sorted(fresh)]
+        place = {port: k for k, port in enumerate(ports)}
+        self._ahead: Values = np.zeros(len(ports))
+        source = {i: place[o] for i, o in fresh.items()}
+        advances = []
+        for n in numbers:
+            given = {p: place[p] for p in sorted(fresh) if p[0] == n}
+            taken = {p: place[p] for p in sorted(set(fresh.values())) if p[0] == n}
+            before = self._exchange_of(n, self._ahead, given, {}, source) if given else None
+            after = self._exchange_of(n, self._ahead, {}, taken, source) if taken else None
+            advances.append(Advance(n, every[n], every[n] * step, self.components[n].step, before, after))
+        return advances
+
+    # ── work ─────────────────────────────────────────────────────────────────────────────────────────────
+
+    def initialize(self, start: float, stop: float, starts: Mapping[str, Mapping[str, float]]) -> None:
+        """Initialise all components, with initial values passed through the connections.
+
+        Args:
+            start: start time [s].
+            stop: stop time [s].
+            starts: start values by component and variable.
+
+        Raises:
+            InputError: a start value that a component does not take.
+            RunError: a component failed.
+        """
+        for number, (name, component) in enumerate(zip(self.graph.names, self.components, strict=True)):
+            try:
+                status = component.enter_initialization(start, stop, starts.get(name, {}))
+            except (InputError, RunError):
+                raise
+            except Exception as error:
+                raise self._wrapped(number, error, start) from error
+            if status:
+                self._judge(number, status, "initialisation", start)
+        for exchange in self._before_first:
+            self._exchange(exchange, self.signals, start)
+        self.propagate(0, start)
+        for number, component in enumerate(self.components):
+            try:
+                status = component.exit_initialization()
+            except Exception as error:
+                raise self._wrapped(number, error, start) from error
+            if status:
+                self._judge(number, status, "the end of initialisation", start)
+        for exchange in self._constants:
+            self._exchange(exchange, self.signals, start)
+
+    def propagate(self, k: int, t: float) -> None:
+        """Pass values through all connections of the components due at tick k.
+
+        Args:
+            k: number of the tick.
+            t: its time [s].
+
+        Raises:
+            RunError: a component failed or gave a value that is not finite.
+        """
+        signals = self.signals
+        signals[0] = t
+        for every, exchange in self._visits:
+            if not k % every:
+                self._exchange(exchange, signals, t)
+        if self._hold_to.size:
+            signals[self._hold_to] = signals[self._hold_from]
+
+    def advance(self, k: int, t: float) -> None:
+        """Step the components due at tick k, each over its own step.
+
+        Args:
+            k: number of the tick.
+            t: its time [s].
+
+        Raises:
+            RunError: a component failed or gave a value that is not finite.
+        """
+        for a in self._advances:
+            # A last own step that leads beyond the end is left out: nobody would read what comes of it.
+            if k % a.every or k + a.every > self._ticks:
+                continue
+            if a.before is not None:
+                self._exchange(a.before, self._ahead, t)
+            try:
+                status = a.step(t, a.h)
+            except Exception as error:
+                raise self._wrapped(a.component, error, t) from error
+            if status:
+                self._judge(a.component, status, "the step", t)
+            if a.after is not None:
+                self._exchange(a.after, self._ahead, t + a.h)
+
+    def _exchange(self, x: Exchange, vector: Values, t: float) -> None:
+        """Do an exchange and check what comes of it."""
+        try:
+            if x.inputs is not None:
+                x.given[:] = vector[x.sources]
+                if status := x.set(x.inputs, x.given):
+                    self._judge(x.component, status, "setting inputs", t)
+            if x.outputs is not None:
+                if status := x.get(x.outputs, x.taken):
+                    self._judge(x.component, status, "reading outputs", t)
+                # Sum of squares: several times faster than isfinite, and finite only if all are.
+                if not x.taken.dot(x.taken) < math.inf:
+                    self._check_finite(x, t)
+        except RunError:
+            raise
+        except Exception as error:
+            raise self._wrapped(x.component, error, t) from error
+
+    # ── failure ──────────────────────────────────────────────────────────────────────────────────────────
+
+    def _check_finite(self, x: Exchange, t: float) -> None:
+        """Name the first value that is not finite; the square of a large one may overflow without harm.
+
+        Raises:
+            ComponentError: there is one.
+        """
+        wrong = np.flatnonzero(~np.isfinite(x.taken))
+        if wrong.size and x.outputs is not None:
+            variable = self.components[x.component].variables[int(x.outputs[wrong[0]])].name
+            message = f"the value is {x.taken[wrong[0]]}, expected a finite number"
+            raise ComponentError(self.graph.names[x.component], message, variable, t)
+
+    def warn(self, number: int, text: str) -> None:
+        """Count a warning of a component."""
+        warned = self.warnings.setdefault(self.graph.names[number], Warned(0, text))
+        warned.count += 1
+
+    def _judge(self, number: int, status: int, what: str, t: float) -> None:
+        """Count a warning; stop on anything worse.
+
+        Raises:
+            ComponentError: status DISCARD or beyond.
+        """
+        name, said = self.graph.names[number], self.components[number].message or "no text"
+        if status == Status.WARNING:
+            self.warn(number, f"{what} at t = {t:.9g} s: {said}")
+            return
+        word = status.name if isinstance(status, Status) else repr(status)
+        raise ComponentError(name, f"{what} ended with status {word}: {said}", time=t)
+
+    def _wrapped(self, number: int, error: Exception, t: float) -> RunError:
+        """An exception out of a component's code as an error that names the component and the place."""
+        if isinstance(error, RunError):
+            return error
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        place = f"{Path(frame.filename).name}:{frame.lineno}"
+        return ComponentError(self.graph.names[number], f"{type(error).__name__}: {error} ({place})", time=t)
+
+
+def _indices(numbers: Iterable[int]) -> Indices:
+    return np.array(list(numbers), dtype=np.intp)
+
+
+def _span(places: Mapping[Port, int]) -> slice:
+    """The piece of a vector that adjacent places make."""
+    return slice(min(places.values()), max(places.values()) + 1) if places else slice(0, 0)
+
+
+def _number(ports: Mapping[Port, int]) -> int:
+    """Number of the component that ports belong to."""
+    return next(iter(ports))[0]

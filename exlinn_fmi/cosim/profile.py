@@ -1,0 +1,81 @@
+"""Where the time of a co-simulation goes: a component that measures another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from time import perf_counter
+
+from exlinn_fmi.components.base import Component, Indices, Status, Values
+
+
+class Timed(Component):
+    """A component that passes every call on and adds up the time taken by set, get and step.
+
+    Args:
+        inner: the component that does the work.
+
+    Attributes:
+        seconds: wall time so far [s].
+    """
+
+    def __init__(self, inner: Component) -> None:
+        self.name, self.variables, self._inner = inner.name, inner.variables, inner
+        self.seconds = 0.0
+
+    @property
+    def message(self) -> str:  # type: ignore[override]  # the contract has a plain attribute
+        """What the inner component last said."""
+        return self._inner.message
+
+    @property
+    def sampled(self) -> bool:
+        """As the inner component."""
+        return self._inner.sampled
+
+    @property
+    def can_save_state(self) -> bool:
+        """As the inner component."""
+        return self._inner.can_save_state
+
+    def enter_initialization(
+        self, start_time: float, stop_time: float, starts: Mapping[str, float]
+    ) -> Status:
+        """Not measured: it happens once."""
+        return self._inner.enter_initialization(start_time, stop_time, starts)
+
+    def exit_initialization(self) -> Status:
+        """Not measured: it happens once."""
+        return self._inner.exit_initialization()
+
+    def set(self, indices: Indices, values: Values) -> Status:
+        """Measured."""
+        began = perf_counter()
+        status = self._inner.set(indices, values)
+        self.seconds += perf_counter() - began
+        return status
+
+    def get(self, indices: Indices, values: Values) -> Status:
+        """Measured."""
+        began = perf_counter()
+        status = self._inner.get(indices, values)
+        self.seconds += perf_counter() - began
+        return status
+
+    def step(self, t: float, h: float) -> Status:
+        """Measured."""
+        began = perf_counter()
+        status = self._inner.step(t, h)
+        self.seconds += perf_counter() - began
+        return status
+
+    def save_state(self) -> object:
+        """As the inner component."""
+        return self._inner.save_state()
+
+    def restore_state(self, state: object) -> None:
+        """As the inner component."""
+        self._inner.restore_state(state)
+
+    def close(self) -> None:
+        """Close the inner component."""
+        self._inner.close()
