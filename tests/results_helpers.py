@@ -85,7 +85,11 @@ PROVENANCE = {
 
 
 def scenario_text(
-    *, control: bool = False, learn: bool = False, simulate: bool = False, description: str = "made of formulas"
+    *,
+    control: bool = False,
+    learn: bool = False,
+    simulate: bool = False,
+    description: str = "made of formulas",
 ) -> str:
     """A scenario of the cart with the parts asked for."""
     text = COMPONENTS.format(name="demo", description=f'"{description}"')
@@ -101,10 +105,10 @@ def make_run(folder: Path, **parts: bool | str) -> Path:
 
 
 def trajectories(stop: float = 10.0, step: float = 1e-3, period: float = 0.01) -> pd.DataFrame:
-    """The cart on ±150 mm at 0.4 Hz, 10 µm beside its reference; the controller's columns held between its samples."""
+    """The cart on ±150 mm at 0.4 Hz, 10 µm beside its reference; the controller holds between its samples."""
     time = step * np.arange(round(stop / step) + 1)
     held = period * np.floor(time / period + 1e-9)
-    alpha, alpha_dot, current, voltage = motion(time)
+    alpha, alpha_dot, current, _ = motion(time)
     reference = 0.15 * np.sin(2 * np.pi * 0.4 * held)
     return pd.DataFrame(
         {
@@ -178,6 +182,10 @@ def write_learning(folder: Path, *, diverges: bool = False) -> pd.DataFrame:
     table.insert(1, "identified", table["true"] * (1 + 1e-5 * np.arange(6)))
     table["rel_error"] = table["identified"] / table["true"] - 1
     table.to_csv(folder / "parameters.csv", index=False)
-    metrics = {"learn.force_mse_test": 3.1e-10, "learn.rollout_nrmse_10s": 2.4e-5, "identify.max_rel_error": 5e-5}
+    metrics = {
+        "learn.force_mse_test": 3.1e-10,
+        "learn.rollout_nrmse_10s": 2.4e-5,
+        "identify.max_rel_error": 5e-5,
+    }
     write_json(folder / "metrics.json", metrics | ({"learn.rollout_nrmse_10s": np.inf} if diverges else {}))
     return frame

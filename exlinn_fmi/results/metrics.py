@@ -181,7 +181,7 @@ def _tracking(frame: pd.DataFrame, loop: Loop, units: Mapping[str, str], settle:
     error = (frame[loop.output] - frame[reference]).to_numpy(dtype=float)[rows]
     if not error.size:
         return {}
-    name = quantity(loop.output, units.get(loop.output, ""))
+    name = quantity(loop.output, units.get(loop.output) or "")
     return {
         f"rmse_{name}": float(np.sqrt(np.mean(error**2))),
         f"max_error_{name}": float(np.max(np.abs(error))),

@@ -68,7 +68,9 @@ def test_fallbacks_are_the_last_count(frame: pd.DataFrame) -> None:
     assert control_metrics(counted, scenario(), UNITS)["control.fallbacks"] == 3
 
 
-def test_input_power_is_that_of_the_controllers_output(metrics: dict[str, float], frame: pd.DataFrame) -> None:
+def test_input_power_is_that_of_the_controllers_output(
+    metrics: dict[str, float], frame: pd.DataFrame
+) -> None:
     voltage = frame["controller.v"].to_numpy()[::10]
     assert metrics["control.input_rms"] == pytest.approx(np.sqrt(np.mean(voltage**2)))
 

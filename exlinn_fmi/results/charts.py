@@ -1,0 +1,438 @@
+"""What the figures show, whoever draws them: panels of lines with names and units, made from a run's tables.
+
+`figures` draws these charts with matplotlib, `interactive` with plotly. Nothing here knows a plant.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from exlinn_fmi.results.metrics import Loop, control_loops
+from exlinn_fmi.results.tables import LEARNED, RunFiles, Table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from exlinn_fmi.scenario.schema import Bounds
+
+Role = Literal["main", "model", "reference", "bound", "error", "other"]
+
+MOST_PANELS = 8
+MOST_LINES = 6
+HUGE = 1e100
+"""Beyond this a value is no measurement but a model that has diverged; drawn as a gap."""
+STILL = 1e-3
+"""A line that moves by less than this share of its size is shown as one that hardly moves."""
+COINCIDE = 0.1
+"""Two lines closer than this share of their range get a strip that shows their difference."""
+COLOURS: dict[Role, str] = {
+    "main": "#0072B2",
+    "model": "#D55E00",
+    "reference": "#D55E00",
+    "bound": "#777777",
+    "error": "#009E73",
+}
+"""Okabe and Ito's palette, which people with any colour vision can tell apart."""
+OTHERS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a panel.
+
+    Args:
+        label: what it is, for the legend; empty where the panel's label says it.
+        x: abscissa, shape (N,).
+        y: ordinate, shape (N,); NaN makes a gap.
+        role: what it stands for, which decides how it looks; each of `other` has a colour of its own.
+        held: whether the value is held until the next one (an input, a sampled signal).
+        points: whether each value stands alone.
+    """
+
+    label: str
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    role: Role = "main"
+    held: bool = False
+    points: bool = False
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes.
+
+    Args:
+        name: name of the quantity.
+        unit: its unit, ``""`` where it has no dimension.
+        lines: what is drawn, first to last.
+        strip: a difference to be shown in a strip of its own below, in `strip_unit`.
+        note: a few words beside the label, e.g. bounds that are out of sight.
+        limits: range of the ordinate, None to fit the lines.
+        log: whether the ordinate is logarithmic.
+    """
+
+    name: str
+    unit: str
+    lines: tuple[Line, ...]
+    strip: Line | None = None
+    strip_unit: str = ""
+    note: str = ""
+    limits: tuple[float, float] | None = None
+    log: bool = False
+
+    @property
+    def label(self) -> str:
+        """Name and unit."""
+        return axis_label(self.name, self.unit)
+
+    @property
+    def strip_label(self) -> str:
+        """Name and unit of the strip."""
+        return axis_label("error", self.strip_unit)
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A figure: panels over one common abscissa.
+
+    Args:
+        name: file name without suffix.
+        title: one line.
+        panels: in reading order.
+        x_label: label of the abscissa.
+        note: what the reader should know besides.
+    """
+
+    name: str
+    title: str
+    panels: tuple[Panel, ...]
+    x_label: str = "time [s]"
+    note: str = ""
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Lowest and highest abscissa of all lines."""
+        return _extremes(np.concatenate([line.x for panel in self.panels for line in panel.lines]))
+
+
+def charts(run: RunFiles) -> list[Chart]:
+    """All charts that a run has data for."""
+    made: list[Chart | None] = []
+    if run.evaluation is not None:
+        made.append(learning_chart(run.evaluation))
+    if run.training is not None:
+        made.append(training_chart(run.training))
+    if run.trajectories is not None:
+        loops = control_loops(run.scenario)
+        made += [control_chart(run.trajectories, loop, several=len(loops) > 1) for loop in loops]
+        if not loops:
+            made.append(trajectory_chart(run.trajectories))
+    return [replace(c, panels=tuple(map(_legible, c.panels))) for c in made if c is not None]
+
+
+# ── the charts ───────────────────────────────────────────────────────────────────────────────────────────
+
+
+def learning_chart(evaluation: Table) -> Chart | None:
+    """Measured against learned on a test that training never saw: the paper's Fig. 3."""
+    frame = evaluation.frame
+    names = [c for c in map(str, frame.columns) if c + LEARNED in frame.columns]
+    time = _values(frame, "time")
+    panels = []
+    for name in names:
+        measured, learned = _values(frame, name), _values(frame, name + LEARNED)
+        panels.append(
+            _comparison(
+                name,
+                evaluation.unit(name),
+                Line("measured", time, measured),
+                Line("learned", time, learned, "model"),
+            )
+        )
+    if not panels:
+        return None
+    return Chart("fig3_learning", "Learned model against measurement on the unseen test", tuple(panels))
+
+
+def training_chart(history: pd.DataFrame) -> Chart | None:
+    """Training and validation loss over the iterations, or whatever the first column counts."""
+    x = str(history.columns[0])
+    losses = [str(c) for c in history.columns[1:] if "loss" in str(c)]
+    roles: dict[str, Role] = {c: "model" if "valid" in c else "main" for c in losses}
+    lines = tuple(
+        Line(words(c), _values(history, x), _positive(_values(history, c)), roles[c]) for c in losses
+    )
+    if not any(np.isfinite(line.y).any() for line in lines):
+        return None
+    return Chart("training", "Training", (Panel("loss", "", lines, log=True),), x_label=words(x))
+
+
+def control_chart(trajectories: Table, loop: Loop, several: bool) -> Chart | None:
+    """Cost, inputs, tracked output and states against their references, solve time: the paper's Fig. 4."""
+    frame = trajectories.frame
+    rows = loop.samples(_values(frame, "time"))
+    output = loop.output if loop.output not in loop.states.values() else None
+    states = [
+        _tracked_panel(trajectories, path, loop.reference_of(name), loop.settings.states.get(name), rows)
+        for name, path in loop.states.items()
+    ]
+    panels = [
+        _cost_panel(trajectories, loop, rows),
+        *(_input_panel(trajectories, loop, name, path) for name, path in loop.inputs.items()),
+        _tracked_panel(trajectories, output, loop.own("reference"), None, rows) if output else None,
+        *states,
+        _solve_time_panel(trajectories, loop, rows),
+    ]
+    shown = tuple(panel for panel in panels if panel is not None)
+    if not shown:
+        return None
+    return Chart(
+        f"fig4_control_{loop.controller}" if several else "fig4_control",
+        "Tracking, inputs and solver" + (f" of {loop.controller}" if several else ""),
+        shown,
+    )
+
+
+def trajectory_chart(trajectories: Table) -> Chart | None:
+    """Every recorded variable, one panel for each unit; what finds no room is named."""
+    frame = trajectories.frame
+    groups: dict[str, list[str]] = {}
+    for column in map(str, frame.columns):
+        if column != "time" and frame[column].dtype.kind in "bif":
+            groups.setdefault(trajectories.unit(column), []).append(column)
+    blocks = [
+        (unit, columns[k : k + MOST_LINES])
+        for unit, columns in groups.items()
+        for k in range(0, len(columns), MOST_LINES)
+    ]
+    if not blocks:
+        return None
+    time = _values(frame, "time")
+    panels = tuple(
+        Panel("", unit, tuple(Line(c, time, _values(frame, c), "other") for c in columns))
+        for unit, columns in blocks[:MOST_PANELS]
+    )
+    left_out = [column for _, columns in blocks[MOST_PANELS:] for column in columns]
+    note = f"Not shown, but in trajectories.csv: {', '.join(left_out)}." if left_out else ""
+    return Chart("trajectories", "Recorded trajectories", panels, note=note)
+
+
+# ── panels ───────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _comparison(name: str, unit: str, first: Line, second: Line, bounds: Bounds | None = None) -> Panel:
+    """Two lines that should be one, on common abscissas, and their difference where no eye can see it."""
+    lines, note = _with_bounds((first, second), bounds, unit)
+    span = _range(first.y)
+    error = second.y - first.y if second.role == "model" else first.y - second.y
+    worst = float(np.max(np.abs(error))) if np.isfinite(error).all() and error.size else np.inf
+    if worst <= COINCIDE * span:
+        factor, error_unit = readable(worst, unit)
+        strip = Line("", first.x, error * factor, "error")
+        return Panel(name, unit, lines, strip, error_unit, note)
+    limits = None
+    if span > 0 and not _range(second.y) <= 20 * span:  # a diverged model must not flatten the measurement
+        low, high = float(np.nanmin(first.y)), float(np.nanmax(first.y))
+        limits = (low - span / 2, high + span / 2)
+        beyond = ~((second.y >= limits[0]) & (second.y <= limits[1]))
+        if beyond.any():
+            note = _join(note, f"{second.label} out of sight from {first.x[beyond.argmax()]:.4g} s")
+    return Panel(name, unit, lines, note=note, limits=limits)
+
+
+def _tracked_panel(
+    table: Table, path: str, reference: str, bounds: Bounds | None, rows: NDArray[np.bool_]
+) -> Panel | None:
+    """A plant variable against its reference, with its bounds; compared where the reference is fresh."""
+    frame = table.frame
+    if path not in frame.columns:
+        return None
+    name, unit, time = _short(path), table.unit(path), _values(frame, "time")
+    line = Line("", time, _values(frame, path))
+    if reference not in frame.columns or not rows.any():
+        lines, note = _with_bounds((line,), bounds, unit)
+        return Panel(name, unit, lines, note=note)
+    at = time[rows]
+    sampled = _comparison(
+        name,
+        unit,
+        Line("measured", at, line.y[rows]),
+        Line("reference", at, _values(frame, reference)[rows], "reference"),
+        bounds,
+    )
+    # What happens between the samples is drawn too, the error is only known at them.
+    return replace(sampled, lines=(Line("measured", time, line.y), *sampled.lines[1:]))
+
+
+def _input_panel(table: Table, loop: Loop, name: str, path: str) -> Panel | None:
+    """A plant input as the controller holds it, with its bounds."""
+    column = next((c for c in (path, loop.own(name)) if c in table.frame.columns), None)
+    if column is None:
+        return None
+    line = Line("", _values(table.frame, "time"), _values(table.frame, column), held=True)
+    lines, note = _with_bounds((line,), loop.settings.inputs.get(name), table.unit(column))
+    return Panel(_short(path), table.unit(column), lines, note=note)
+
+
+def _cost_panel(table: Table, loop: Loop, rows: NDArray[np.bool_]) -> Panel | None:
+    """The controller's cost J at its samples; logarithmic where it spans decades."""
+    column = loop.own("cost")
+    if column not in table.frame.columns or not rows.any():
+        return None
+    cost = _values(table.frame, column)[rows]
+    logarithmic = bool(np.all(cost > 0)) and float(np.max(cost)) > 1e3 * float(np.min(cost))
+    line = Line("", _values(table.frame, "time")[rows], cost, held=True)
+    return Panel("cost J", "", (line,), log=logarithmic)
+
+
+def _solve_time_panel(table: Table, loop: Loop, rows: NDArray[np.bool_]) -> Panel | None:
+    """Time that each solve took, beside the sampling time that it must not exceed."""
+    column = loop.own("solve_time")
+    if column not in table.frame.columns or not rows.any():
+        return None
+    time, solve = _values(table.frame, "time")[rows], 1e3 * _values(table.frame, column)[rows]
+    lines: tuple[Line, ...] = (Line("", time, solve, points=True),)
+    period, longest = 1e3 * loop.period, _extremes(solve)[1]
+    if longest > period / 2:
+        lines += (Line("bound", time[[0, -1]], np.full(2, period), "bound"),)
+    return Panel(
+        "solve time",
+        "ms",
+        lines,
+        note=f"sampling time {period:g} ms",
+        limits=(0, 1.1 * max(longest, period if len(lines) > 1 else 0)) if longest > 0 else None,
+    )
+
+
+def _with_bounds(lines: tuple[Line, ...], bounds: Bounds | None, unit: str) -> tuple[tuple[Line, ...], str]:
+    """Lines with those bounds that are near enough not to flatten them, and all bounds in words."""
+    given = [b for b in (bounds.min, bounds.max) if b is not None] if bounds is not None else []
+    x = lines[0].x
+    if bounds is None or not given or not x.size:
+        return lines, ""
+    low, high = _extremes(lines[0].y)
+    reach = 0.5 * max(high - low, 1e-9 * max(abs(low), abs(high)))
+    near = [b for b in given if low - reach <= b <= high + reach]
+    drawn = tuple(Line("bound", x[[0, -1]], np.full(2, b), "bound") for b in near)
+    if len(given) == 2:
+        words = f"bounds {given[0]:g} … {given[1]:g} {typeset(unit)}"
+    else:
+        words = f"bound {'≥' if bounds.max is None else '≤'} {given[0]:g} {typeset(unit)}"
+    return lines + drawn, words.replace("-", "−").strip()
+
+
+def _legible(panel: Panel) -> Panel:
+    """A panel in a multiple of its unit where numbers would be long, not zoomed into rounding errors."""
+    if panel.log:
+        return panel
+    low, high = panel.limits or _extremes(np.concatenate([line.y for line in panel.lines]))
+    size = max(abs(low), abs(high))
+    if high - low < STILL * size:
+        panel = replace(panel, limits=(low - STILL * size, high + STILL * size))
+    factor, unit = readable(size, panel.unit)
+    if 1e-2 <= size < 1e4 or factor == 1:
+        return panel
+    return replace(
+        panel,
+        unit=unit,
+        lines=tuple(replace(line, y=line.y * factor) for line in panel.lines),
+        limits=panel.limits and (panel.limits[0] * factor, panel.limits[1] * factor),
+    )
+
+
+# ── words and numbers ────────────────────────────────────────────────────────────────────────────────────
+
+
+def axis_label(name: str, unit: str) -> str:
+    """Name and unit as an axis says them."""
+    return name if name and not unit else f"{name} [{typeset(unit) or '1'}]".strip()
+
+
+def typeset(unit: str) -> str:
+    """A unit as print has it: ``kg.m2/s2`` is kg·m²/s²."""
+    return re.sub(r"(?<=[^\W\d])-?\d+", lambda m: m[0].translate(SUPERSCRIPTS), unit).replace(".", "·")
+
+
+def readable(size: float, unit: str) -> tuple[float, str]:
+    """A factor that brings values up to `size` between 1 and 1000, and the unit they then have."""
+    if not 0 < size < np.inf:
+        return 1.0, unit
+    exponent = int(np.clip(3 * np.floor(np.log10(size) / 3), -15, 6))
+    if exponent == 0:
+        return 1.0, unit
+    head = unit.partition("/")[0].partition(".")[0]
+    if head.isalpha() and head != "kg":
+        return 10.0**-exponent, PREFIXES[exponent] + unit
+    power = "10" + str(exponent).translate(SUPERSCRIPTS)
+    return 10.0**-exponent, f"{power} {unit}".strip()
+
+
+def decimate(y: NDArray[np.float64], most: int) -> NDArray[np.intp]:
+    """Indices of at most about `most` points that keep every peak and every gap of a line.
+
+    Args:
+        y: ordinates, shape (N,).
+        most: number of points wanted, at least 8.
+
+    Returns:
+        Rising indices, all of them where N ≤ `most`.
+    """
+    n = len(y)
+    if n <= most:
+        return np.arange(n)
+    width = -(-n // (most // 4))
+    rows = -(-n // width)
+    block = np.pad(y, (0, rows * width - n), mode="edge").reshape(rows, width)
+    gap = np.isnan(block)
+    kept = (
+        np.where(gap, np.inf, block).argmin(axis=1),
+        np.where(gap, -np.inf, block).argmax(axis=1),
+        gap.argmax(axis=1),  # the first point of a block where it has no gap
+    )
+    corner = width * np.arange(rows)
+    indices = np.concatenate([np.minimum(corner + k, n - 1) for k in kept] + [np.array([n - 1])])
+    return np.unique(indices)
+
+
+def _values(frame: pd.DataFrame, column: str) -> NDArray[np.float64]:
+    """A column as numbers, with NaN for what is not finite or huge beyond meaning."""
+    values = frame[column].to_numpy(dtype=float)
+    return np.where(np.abs(values) < HUGE, values, np.nan)
+
+
+def _positive(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values that a logarithmic axis can show."""
+    return np.where(values > 0, values, np.nan)
+
+
+def _extremes(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Lowest and highest of the values that are numbers, (0, 0) if none is."""
+    known = values[np.isfinite(values)]
+    return (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+
+
+def _range(values: NDArray[np.float64]) -> float:
+    """Highest less lowest value, NaN where not all are numbers."""
+    return float(np.ptp(values)) if np.isfinite(values).all() and values.size else np.nan
+
+
+def _short(path: str) -> str:
+    """A variable's name without its component."""
+    return path.split(".", 1)[1]
+
+
+def words(name: str) -> str:
+    """A column's name in words."""
+    return name.replace("_", " ")
+
+
+def _join(*notes: str) -> str:
+    """Notes on one line."""
+    return "; ".join(note for note in notes if note)
