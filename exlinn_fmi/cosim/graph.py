@@ -147,7 +147,7 @@ class Graph:
         for i, o in broken.assumed:
             reason = (
                 f"{self.names[o[0]]} does not say whether {self.variable(o).name} depends on "
-                f"{self.variable(i).name} directly, and a loop closes if it does: taken not to"
+                f"{self.variable(i).name} directly; taken not to, or a loop would close"
             )
             yield Delay("dependency", self.path(i), self.path(o), reason)
 
@@ -158,6 +158,7 @@ class Graph:
         sections = {
             "components, in the order in which their outputs are known": self._component_lines(),
             "connections": [self._connection_line(edge) for edge in self.connections],
+            "inputs that keep their start values": self._open_inputs(),
             "direct feed-through between connected variables": self._feed_through_lines(),
             "order of values at a communication point": self._visit_lines(),
             "algebraic loops": [" — ".join(loop) for loop in self.loops],
@@ -173,14 +174,13 @@ class Graph:
         lines = []
         for name in self.order:
             number = self.names.index(name)
-            ins = {i for _, i in self.connections if i[0] == number}
-            outs = {o for o, _ in self.connections if o[0] == number}
-            causalities = [v.causality for v in self._parts[number].variables]
-            lines.append(
-                f"{name:<{width}}  {causalities.count('input')} inputs ({len(ins)} connected), "
-                f"{causalities.count('output')} outputs ({len(outs)} connected)"
-                + (", sampled: outputs hold between communication points" * self._parts[number].sampled)
-            )
+            counts = []
+            for word, causality, end in (("inputs", "input", 1), ("outputs", "output", 0)):
+                there = sum(v.causality == causality for v in self._parts[number].variables)
+                connected = {edge[end] for edge in self.connections if edge[end][0] == number}
+                counts.append(f"{len(connected)} of {there} {word} connected")
+            sampled = ["sampled"] * self._parts[number].sampled
+            lines.append(f"{name:<{width}}  {', '.join(counts + sampled)}")
         return lines
 
     def _connection_line(self, edge: Edge) -> str:
@@ -189,6 +189,15 @@ class Graph:
         if None in units or units[0] == units[1]:
             return f"{text} [{units[0] or units[1] or '-'}]"
         return f"{text} [{units[0]} → {units[1]}]"
+
+    def _open_inputs(self) -> list[str]:
+        driven = {i for _, i in self.connections}
+        return [
+            self.path((number, k))
+            for number, component in enumerate(self._parts)
+            for k, variable in enumerate(component.variables)
+            if variable.causality == "input" and (number, k) not in driven
+        ]
 
     def _feed_through_lines(self) -> list[str]:
         lines = []
@@ -209,7 +218,7 @@ class Graph:
                 for verb, indices in (("set", visit.inputs), ("get", visit.outputs))
                 if indices
             ]
-            if acts:
+            if acts:  # a component without connections is visited for what is recorded of it
                 lines.append(f"{self.names[visit.component]:<{width}}  {', '.join(acts)}")
         return lines
 
