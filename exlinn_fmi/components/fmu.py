@@ -163,6 +163,8 @@ class FmuComponent(Component):
             ComponentError: the FMU reports an error.
         """
         assert isinstance(state, _SavedState)
+        if state.generation != self._instance.generation:
+            raise ComponentError(self.name, "restoring the state failed: it is of an earlier run")
         try:
             self._instance.set_state(state.pointer)
         except RuntimeError as error:
@@ -185,11 +187,11 @@ class FmuComponent(Component):
         if code == 0:
             return Status.OK
         self._instance.code(code)
-        word = _STATUS[code] if 0 <= code < len(_STATUS) else str(code)
         prefix = self._instance.prefix
+        word = f"{prefix}{_STATUS[code]}" if 0 <= code < len(_STATUS) else f"the unknown status {code}"
         said = self._instance.remark or self._instance.said()
         self._instance.remark = ""
-        self.message = f"{prefix}{function} returned {prefix}{word}{f': {said}' if said else ''}"
+        self.message = f"{prefix}{function} returned {word}{f': {said}' if said else ''}"
         # Pending (5) is for asynchronous steps, which we never ask for.
         return Status(code) if 0 <= code <= Status.FATAL else Status.ERROR
 
@@ -247,8 +249,8 @@ class _SavedState:
     """A state saved by an FMU, freed with this object."""
 
     def __init__(self, instance: Instance) -> None:
-        self.pointer = instance.get_state()
-        weakref.finalize(self, _free_state, instance, instance.generation, self.pointer).atexit = False
+        self.pointer, self.generation = instance.get_state(), instance.generation
+        weakref.finalize(self, _free_state, instance, self.generation, self.pointer).atexit = False
 
 
 def _free_state(instance: Instance, generation: int, state: int) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import struct
 import tempfile
 import zipfile
 import zlib
@@ -29,6 +30,9 @@ LARGEST_DESCRIPTION = 256 * 2**20
 
 _UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 """What zipfile raises for damaged, encrypted and unknown contents."""
+
+_Key = tuple[str, int]
+"""Accessor and value reference of a variable."""
 
 _INTEGERS = ("Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64")
 _TYPES: dict[str, VariableType] = {
@@ -138,6 +142,7 @@ def unpack(description: FmuDescription) -> Path:
                     f"{free / 1e6:.0f} MB free"
                 )
             archive.extractall(folder, wanted)
+            _check_whole(description, folder)
         except BaseException as error:
             shutil.rmtree(folder, ignore_errors=True)
             if isinstance(error, OSError):
@@ -243,6 +248,23 @@ def _check_binary(description: FmuDescription, names: Sequence[str]) -> None:
     )
 
 
+def _check_whole(description: FmuDescription, folder: Path) -> None:
+    """Refuse an ELF binary that lacks part of a segment: the loader would not refuse it, but crash on it."""
+    library = folder / "binaries" / description.platform / description.identifier
+    data = library.with_name(f"{library.name}{fmpy.sharedLibraryExtension}").read_bytes()
+    if data[:6] != b"\x7fELF\x02\x01" or len(data) < 64:
+        return  # not a 64-bit ELF file: whatever it is, the loader says so
+    (table,) = struct.unpack_from("<Q", data, 32)
+    entry, count = struct.unpack_from("<HH", data, 54)
+    segments = range(table, table + entry * count, max(entry, 1))
+    ends = [sum(struct.unpack_from("<Q16xQ", data, k + 8)) for k in segments if k + 40 <= len(data)]
+    if len(ends) < count or max(ends, default=0) > len(data):
+        raise FmuError(
+            f"{description.path}: the binary for {description.platform} is cut short at {len(data)} bytes; "
+            "copy or export the FMU again"
+        )
+
+
 # ── the model description ────────────────────────────────────────────────────────────────────────────────
 
 
@@ -259,21 +281,25 @@ def _description(path: Path, model: Any) -> FmuDescription:
         raise FmuError(f"{path}: two variables are called {twice!r}")
     version: Literal[2, 3] = 2 if model.fmiVersion == "2.0" else 3
     enumeration = "Integer" if version == 2 else "Int64"
-    inputs = {v.valueReference: v.name for v in scalars if v.causality == "input"}
-    depends = {
-        unknown.variable.valueReference: None
-        if unknown.dependencies is None
-        else tuple(inputs[d.valueReference] for d in unknown.dependencies if d.valueReference in inputs)
-        for unknown in model.outputs
-    }
+
+    def key(v: Any) -> _Key:
+        """Value references of FMI 2 are unique within a type only; aliases share one."""
+        return enumeration if v.type == "Enumeration" else v.type, v.valueReference
+
+    inputs = {key(v): v.name for v in reversed(scalars) if v.causality == "input"}
+    depends: dict[_Key, tuple[str, ...] | None] = {}
+    for unknown in model.outputs:
+        said = unknown.dependencies
+        direct = None if said is None else dict.fromkeys(inputs[key(d)] for d in said if key(d) in inputs)
+        depends[key(unknown.variable)] = None if direct is None else tuple(direct)
     return FmuDescription(
         path=path,
         version=version,
         identifier=identifier,
         token=model.guid or "",
-        variables=tuple(_variable(path, v, depends) for v in scalars),
-        accessors=tuple(enumeration if v.type == "Enumeration" else v.type for v in scalars),
-        references=tuple(v.valueReference for v in scalars),
+        variables=tuple(_variable(path, v, depends.get(key(v))) for v in scalars),
+        accessors=tuple(key(v)[0] for v in scalars),
+        references=tuple(key(v)[1] for v in scalars),
         equal_steps=not use.canHandleVariableCommunicationStepSize,
         saves_state=use.canGetAndSetFMUstate,
         once=use.canBeInstantiatedOnlyOncePerProcess,
@@ -282,7 +308,7 @@ def _description(path: Path, model: Any) -> FmuDescription:
     )
 
 
-def _variable(path: Path, v: Any, depends: dict[int, tuple[str, ...] | None]) -> Variable:
+def _variable(path: Path, v: Any, depends_on: tuple[str, ...] | None) -> Variable:
     """One variable in our words.
 
     Raises:
@@ -309,7 +335,7 @@ def _variable(path: Path, v: Any, depends: dict[int, tuple[str, ...] | None]) ->
             type=_TYPES[v.type],
             start=_number(v.start),
             description=v.description or "",
-            depends_on=depends.get(v.valueReference) if causality == "output" else (),
+            depends_on=depends_on if causality == "output" else (),
             min=_number(low),
             max=_number(high),
         )

@@ -138,6 +138,14 @@ class Instance(ABC):
                 f"{self.description.path}: the FMU refuses to be instantiated"
                 f"{self.said(': ')}{self._tool_hint()}"
             )
+        # Logging is on, or FMUs keep silent on errors too; but only in the standard categories for trouble.
+        wanted = [c for c in self.description.log_categories if c.startswith("logStatus")]
+        if wanted:
+            names = (ctypes.c_char_p * len(wanted))(*(c.encode() for c in wanted))
+            # What it returns does not matter: an FMU that cannot choose runs all the same.
+            self.function("SetDebugLogging", c_void_p, c_bool, c_size_t, c_void_p)(
+                self.pointer, True, len(wanted), names
+            )
 
     def restart(self) -> None:
         """Back to the state after instantiation, by a fresh instance where the FMU allows more than one."""
@@ -286,14 +294,6 @@ class Instance2(Instance):
             False,
             True,
         )
-        # Logging is on, or FMUs keep silent on errors too; but only in the standard categories for trouble.
-        wanted = [c for c in self.description.log_categories if c.startswith("logStatus")]
-        if pointer and wanted:
-            names = (ctypes.c_char_p * len(wanted))(*(c.encode() for c in wanted))
-            # An FMU that does not know this call runs all the same.
-            self.function("SetDebugLogging", c_void_p, c_int, c_size_t, c_void_p)(
-                pointer, 1, len(wanted), names
-            )
         return pointer
 
     def set_up(self, start_time: float, stop_time: float) -> int:

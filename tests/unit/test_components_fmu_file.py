@@ -1,0 +1,274 @@
+"""FMU files that cannot be used: what the error says, and that nothing of them gets onto the disk."""
+
+from __future__ import annotations
+
+import errno
+import platform
+import stat
+import tempfile
+import warnings
+import zipfile
+from pathlib import Path
+
+import fmpy
+import pytest
+from fmu_helpers import VARIABLES_2, description_2, library, pack, probe
+
+from exlinn_fmi.components import fmu_file
+from exlinn_fmi.components.fmu import FmuComponent, read_variables
+from exlinn_fmi.components.fmu_file import read_description, unpack
+from exlinn_fmi.errors import FmuError, StorageError
+
+BINARY = f"binaries/{fmpy.platform}/Probe{fmpy.sharedLibraryExtension}"
+
+
+def with_description(folder: Path, text: str) -> Path:
+    return pack(folder / "Probe.fmu", {"modelDescription.xml": text})
+
+
+# ── not an FMU ───────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_missing_file_is_told_with_the_nearest_name(tmp_path: Path) -> None:
+    probe(tmp_path)
+    with pytest.raises(FmuError, match=r"Prob\.fmu: no such file; did you mean 'Probe\.fmu'\?"):
+        read_variables(tmp_path / "Prob.fmu")
+
+
+def test_a_missing_folder_is_told(tmp_path: Path) -> None:
+    with pytest.raises(FmuError, match="no such file; there are no FMUs there"):
+        read_variables(tmp_path / "nowhere" / "Probe.fmu")
+
+
+def test_a_folder_is_told(tmp_path: Path) -> None:
+    with pytest.raises(FmuError, match=r"is a folder, expected an \.fmu file"):
+        read_variables(tmp_path)
+
+
+def test_a_file_that_is_no_archive_is_told(tmp_path: Path) -> None:
+    (tmp_path / "Probe.fmu").write_text("<html>404</html>")
+    with pytest.raises(FmuError, match="not a zip archive, as every FMU is"):
+        read_variables(tmp_path / "Probe.fmu")
+
+
+@pytest.mark.parametrize("kept", [0.2, 0.9, 0.999])
+def test_a_truncated_archive_is_told(tmp_path: Path, kept: float) -> None:
+    path = probe(tmp_path)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * kept)])
+    with pytest.raises(FmuError, match=r"the zip archive is damaged or cut short \(\d+ bytes"):
+        FmuComponent("probe", path)
+
+
+def test_a_damaged_binary_in_the_archive_is_told(tmp_path: Path) -> None:
+    path = probe(tmp_path)
+    with zipfile.ZipFile(path) as archive:
+        info = archive.getinfo(BINARY)
+    data = bytearray(path.read_bytes())
+    middle = info.header_offset + 200
+    data[middle : middle + 40] = bytes(40)
+    path.write_bytes(data)
+    with pytest.raises(FmuError, match="damaged or cut short"):
+        FmuComponent("probe", path)
+
+
+def test_a_file_that_may_not_be_read_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = probe(tmp_path)
+
+    def refuse(_: Path) -> None:  # root, as in containers, may read every file
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(zipfile, "ZipFile", refuse)
+    with pytest.raises(FmuError, match="cannot be read: Permission denied"):
+        read_variables(path)
+
+
+def test_an_archive_without_model_description_is_told(tmp_path: Path) -> None:
+    path = pack(tmp_path / "Probe.fmu", {"readme.txt": "hello"})
+    with pytest.raises(FmuError, match=r"no modelDescription\.xml at the top of the archive; no FMU"):
+        read_variables(path)
+
+
+def test_a_zipped_folder_is_told(tmp_path: Path) -> None:
+    path = pack(tmp_path / "Probe.fmu", {"Probe/modelDescription.xml": description_2()})
+    with pytest.raises(FmuError, match="zip the folder's contents, not the folder"):
+        read_variables(path)
+
+
+# ── a model description that cannot be used ──────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<fmiModelDescription fmiVersion='2.0'", "no well-formed XML: .*line 1"),
+        ("<html/>", "begins with <html>, expected <fmiModelDescription>"),
+        (description_2(version="1.0"), r"FMI version 1\.0; expected 2\.0 or 3\.0"),
+        (description_2(use="ModelExchange"), "no Co-Simulation: it is for ModelExchange only"),
+        ('<fmiModelDescription fmiVersion="2.0"/>', "no Co-Simulation: it names no kind of use"),
+        (description_2(identifier="../../Probe"), "the model identifier '../../Probe' is no file name"),
+        (description_2(identifier=""), "the model identifier '' is no file name"),
+        (description_2(variables=VARIABLES_2 * 2), "two variables are called 'u'"),
+        (
+            description_2(variables=VARIABLES_2.replace('start="2" min', 'start="two" min')),
+            r"variable 'gain' \(line \d+\): could not convert string to float: 'two'",
+        ),
+        (
+            description_2(
+                variables=VARIABLES_2.replace('declaredType="Mode" start', 'declaredType="X" start')
+            ),
+            r"does not follow FMI 2\.0: .*declaredType",
+        ),
+        (
+            description_2(variables=VARIABLES_2.replace('valueReference="1" ', "", 1)),
+            r"does not follow FMI 2\.0: .*valueReference",
+        ),
+    ],
+)
+def test_a_model_description_that_cannot_be_used_is_told(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(FmuError, match=message):
+        read_variables(with_description(tmp_path, text))
+
+
+def test_a_problem_that_no_schema_knows_is_told_in_fmpys_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **options: bool) -> None:
+        if not options["validate"]:
+            raise KeyError("odd")
+
+    monkeypatch.setattr(fmpy, "read_model_description", broken)
+    with pytest.raises(FmuError, match=r"does not follow FMI 2\.0: KeyError: 'odd'"):
+        read_variables(with_description(tmp_path, description_2()))
+
+
+def test_a_huge_model_description_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fmu_file, "LARGEST_DESCRIPTION", 1000)
+    with pytest.raises(FmuError, match="expected at most"):
+        read_variables(with_description(tmp_path, description_2()))
+
+
+# ── an archive that means harm ───────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("name", ["../evil.txt", "/etc/evil.txt", "a/../../evil.txt", "..\\evil", "C:/evil"])
+def test_members_outside_the_folder_are_refused(tmp_path: Path, name: str) -> None:
+    path = pack(tmp_path / "Probe.fmu", {"modelDescription.xml": description_2(), name: "evil"})
+    with pytest.raises(FmuError, match="would be written outside its folder"):
+        FmuComponent("probe", path)
+
+
+def test_a_member_that_is_there_twice_is_refused(tmp_path: Path) -> None:
+    path = probe(tmp_path)
+    with warnings.catch_warnings(), zipfile.ZipFile(path, "a") as archive:
+        warnings.simplefilter("ignore")
+        archive.writestr("modelDescription.xml", description_2())
+    with pytest.raises(FmuError, match=r"holds 'modelDescription\.xml' twice"):
+        read_variables(path)
+
+
+def test_an_archive_that_does_not_fit_is_not_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    path = probe(tmp_path)
+    usage = type("Usage", (), {"free": 10})
+    monkeypatch.setattr(fmu_file.shutil, "disk_usage", lambda _: usage)
+    with pytest.raises(StorageError, match="MB free"):
+        FmuComponent("probe", path)
+    assert not list((tmp_path / "temporary").iterdir())
+
+
+def test_a_disk_that_fills_while_unpacking_is_told(
+    tmp_path: Path, tiny_disk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tiny_disk))
+    monkeypatch.setattr(fmu_file.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 1e12}))
+    members = {
+        "modelDescription.xml": description_2(),
+        BINARY: library("probe2.c"),
+        "resources/x": bytes(10**6),
+    }
+    path = pack(tmp_path / "Probe.fmu", members)
+    with pytest.raises(StorageError, match=r"Probe\.fmu: cannot be unpacked to .*No space left"):
+        FmuComponent("probe", path)
+    assert not list(tiny_disk.iterdir())
+
+
+# ── binaries ─────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_missing_binary_is_told_with_those_there_are_and_what_to_do(tmp_path: Path) -> None:
+    members = {
+        "modelDescription.xml": description_2(),
+        "binaries/win64/Probe.dll": "MZ",
+        "binaries/win32/Probe.dll": "MZ",
+        "sources/Probe.c": "int x;",
+    }
+    path = pack(tmp_path / "Probe.fmu", members)
+    assert read_variables(path)
+    with pytest.raises(FmuError) as error:
+        FmuComponent("probe", path)
+    assert str(error.value) == (
+        f"{path}: no binary for {fmpy.platform} in it (found: win32, win64); "
+        f"export it again for {fmpy.platform}, or build the sources in it: fmpy compile Probe.fmu"
+    )
+
+
+def test_an_fmu_without_any_binary_is_told(tmp_path: Path) -> None:
+    with pytest.raises(FmuError, match=r"\(found: none\); export it again for \w+$"):
+        FmuComponent("probe", with_description(tmp_path, description_2()))
+
+
+def test_a_binary_of_another_name_is_told(tmp_path: Path) -> None:
+    members = {"modelDescription.xml": description_2(), f"binaries/{fmpy.platform}/Other.so": "x"}
+    path = pack(tmp_path / "Probe.fmu", members)
+    with pytest.raises(FmuError, match=rf"has no Probe\{fmpy.sharedLibraryExtension} \(found: Other\.so\)"):
+        FmuComponent("probe", path)
+
+
+FOREIGN = bytes.fromhex("7f454c46020101000000000000000000") + bytes.fromhex("0300b700") + bytes(200)
+"""The head of a shared library for AArch64."""
+
+
+@pytest.mark.parametrize("binary", [b"", b"not a library", FOREIGN])
+def test_a_binary_that_cannot_be_loaded_is_told(tmp_path: Path, binary: bytes) -> None:
+    path = pack(tmp_path / "Probe.fmu", {"modelDescription.xml": description_2(), BINARY: binary})
+    before = Path.cwd()
+    with pytest.raises(FmuError) as error:
+        FmuComponent("probe", path)
+    assert f"the binary for {fmpy.platform} cannot be loaded: {BINARY}: " in str(error.value)
+    assert "damaged, made for another machine, or need libraries" in str(error.value)
+    assert Path.cwd() == before
+
+
+@pytest.mark.parametrize("kept", [100, 2000, 9000])
+def test_a_binary_that_is_cut_short_is_told_before_the_loader_crashes_on_it(
+    tmp_path: Path, kept: int
+) -> None:
+    members = {"modelDescription.xml": description_2(), BINARY: library("probe2.c")[:kept]}
+    with pytest.raises(FmuError, match=rf"is cut short at {kept} bytes"):
+        FmuComponent("probe", pack(tmp_path / "Probe.fmu", members))
+
+
+def test_only_what_this_machine_needs_is_unpacked(tmp_path: Path) -> None:
+    members = {
+        "modelDescription.xml": description_2(),
+        BINARY: library("probe2.c"),
+        "binaries/win64/Probe.dll": "MZ",
+        "sources/Probe.c": "int x;",
+        "documentation/index.html": "<html/>",
+        "resources/table.txt": "1 2 3",
+    }
+    folder = unpack(read_description(pack(tmp_path / "Probe.fmu", members)))
+    files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    assert files == {"modelDescription.xml", BINARY, "resources/table.txt"}
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    fmu_file.shutil.rmtree(folder)
+
+
+def test_the_platform_is_named_as_the_fmi_version_has_it(tmp_path: Path) -> None:
+    assert read_description(probe(tmp_path)).platform == fmpy.platform
+    three = read_description(probe(tmp_path, version=3)).platform
+    assert three.startswith(platform.machine().lower().replace("amd64", "x86_64"))
