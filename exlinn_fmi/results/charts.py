@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from itertools import cycle
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -91,6 +92,12 @@ class Panel:
     def label(self) -> str:
         """Name and unit."""
         return axis_label(self.name, self.unit)
+
+    @property
+    def colours(self) -> list[str]:
+        """Colour of each line."""
+        own = cycle(OTHERS)
+        return [COLOURS.get(line.role) or next(own) for line in self.lines]
 
     @property
     def strip_label(self) -> str:
@@ -399,6 +406,11 @@ def decimate(y: NDArray[np.float64], most: int) -> NDArray[np.intp]:
     corner = width * np.arange(rows)
     indices = np.concatenate([np.minimum(corner + k, n - 1) for k in kept] + [np.array([n - 1])])
     return np.unique(indices)
+
+
+def shortened(name: str, most: int = 52) -> str:
+    """A name that fits in a legend, cut in the middle."""
+    return name if len(name) <= most else f"{name[: most // 2 - 1]}…{name[-most // 2 :]}"
 
 
 def _values(frame: pd.DataFrame, column: str) -> NDArray[np.float64]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from itertools import count
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
@@ -15,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from exlinn_fmi.data.files import write_bytes
-from exlinn_fmi.results.charts import COLOURS, OTHERS, Chart, Line, Panel, Role, charts, decimate
+from exlinn_fmi.results.charts import COLOURS, Chart, Line, Panel, Role, charts, decimate, shortened
 from exlinn_fmi.results.tables import read_run
 
 if TYPE_CHECKING:
@@ -158,7 +157,7 @@ def _header(panel: Panel) -> float:
 
 def _own_names(panel: Panel) -> list[str]:
     """What a panel's own legend names."""
-    return [_shortened(line.label) for line in panel.lines if line.role == "other"]
+    return [shortened(line.label) for line in panel.lines if line.role == "other"]
 
 
 def _legend_columns(names: list[str]) -> int:
@@ -171,7 +170,7 @@ def _head(figure: Figure, title: str, height: float) -> None:
     figure.text(
         LEFT / WIDTH,
         1 - 0.06 / height,
-        _plain(_shortened(title, 90)),
+        _plain(shortened(title, 90)),
         fontsize=9,
         fontweight="bold",
         va="top",
@@ -195,9 +194,8 @@ def _head(figure: Figure, title: str, height: float) -> None:
 
 def _fill(axes: Axes, panel: Panel, most: int) -> None:
     """Draw a panel's lines, label and, where its lines are its own, its legend."""
-    colour = count()
-    for line in panel.lines:
-        _plot(axes, line, COLOURS.get(line.role) or OTHERS[next(colour) % len(OTHERS)], most)
+    for line, colour in zip(panel.lines, panel.colours, strict=True):
+        _plot(axes, line, colour, most)
     if panel.log and any(np.isfinite(line.y).any() for line in panel.lines):
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(numticks=6))
@@ -238,13 +236,8 @@ def _plot(axes: Axes, line: Line, colour: str, most: int) -> None:
         markeredgewidth=0,
         linewidth=1.3 if line.role in ("model", "reference") else 0.9,
         drawstyle="steps-post" if line.held else "default",
-        label=_plain(_shortened(line.label)) or "_nolegend_",
+        label=_plain(shortened(line.label)) or "_nolegend_",
     )
-
-
-def _shortened(name: str, most: int = 52) -> str:
-    """A name that fits in a legend, cut in the middle."""
-    return name if len(name) <= most else f"{name[: most // 2 - 1]}…{name[-most // 2 :]}"
 
 
 def _plain(text: str) -> str:

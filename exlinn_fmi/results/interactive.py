@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from exlinn_fmi.results.charts import COLOURS, OTHERS, Chart, Line, Panel, Role, decimate
+from exlinn_fmi.results.charts import COLOURS, Chart, Line, Panel, Role, decimate, shortened
 
 POINTS_A_LINE, POINTS_A_CHART = 5000, 60_000
 DASHES: dict[Role, str] = {"model": "dash", "reference": "dash", "bound": "dot"}
 
 # Heights in pixels; plotly wants shares of the whole.
-TOP, BOTTOM, HEADER, MAIN, STRIP_HEADER, STRIP = 10, 55, 42, 170, 20, 48
-LEGEND_LINE = 17
+TOP, BOTTOM, HEADER, MAIN, STRIP_HEADER, STRIP = 30, 55, 36, 170, 20, 48
+LABEL_LINE = 16
+LABEL_WIDTH = 58  # characters
 GAP = 0.09
 """Share of the width between two columns."""
 
@@ -29,7 +30,7 @@ def plotly_figure(chart: Chart) -> dict[str, Any]:
     """
     columns = min(2, len(chart.panels))
     rows = [chart.panels[k : k + columns] for k in range(0, len(chart.panels), columns)]
-    headers = [HEADER + LEGEND_LINE * max(0, max(map(_own_lines, row)) - 2) for row in rows]
+    headers = [HEADER + LABEL_LINE * max(_label(panel).count("<br>") for panel in row) for row in rows]
     heights = [h + MAIN + _strip(row) for h, row in zip(headers, rows, strict=True)]
     height = sum(heights)
     width = (1 - GAP * (columns - 1)) / columns
@@ -45,7 +46,7 @@ def plotly_figure(chart: Chart) -> dict[str, Any]:
             foot = lower + (STRIP + STRIP_HEADER if panel.strip else 0)
             drawing.add(panel, x, (foot / height, top / height), lowest and panel.strip is None)
             if panel.strip is not None:
-                drawing.add_strip(panel, x, (lower / height, (lower + STRIP) / height), lowest)
+                drawing.add_strip(panel, panel.strip, x, (lower / height, (lower + STRIP) / height), lowest)
         upper = lower
     drawing.layout |= {
         "height": height + TOP + BOTTOM,
@@ -66,31 +67,34 @@ class _Drawing:
     def __init__(self, most: int, chart: Chart) -> None:
         self.most, self.x_label, self.span = most, chart.x_label, chart.span
         self.data: list[dict[str, Any]] = []
-        self.layout: dict[str, Any] = {"annotations": []}
+        legend: dict[str, Any] = {
+            "x": 0,
+            "y": 1,
+            "yanchor": "bottom",
+            "orientation": "h",
+            "bgcolor": "rgba(0,0,0,0)",
+        }
+        self.layout: dict[str, Any] = {"annotations": [], "legend": legend}
         self.axes = 0
-        self.legends = 0
+        self.named: set[str] = set()
 
     def add(self, panel: Panel, x: tuple[float, float], y: tuple[float, float], lowest: bool) -> None:
         """Add a panel in a domain of the figure given in shares of its width and height."""
-        vertical: dict[str, Any] = {"type": "log", "dtick": 1} if panel.log else {"nticks": 6}
+        vertical: dict[str, Any] = _decades(panel) if panel.log else {"nticks": 6}
         if panel.limits is not None:
             vertical["range"] = list(panel.limits)
         self._axes(x, y, lowest, vertical)
-        self._label(f"<b>{escape(panel.label)}</b>   {escape(panel.note)}", x[0], y[1])
-        legend = self._legend(x[1], y[1])
-        own = 0
-        for line in panel.lines:
-            colour = COLOURS.get(line.role) or OTHERS[own % len(OTHERS)]
-            own += line.role == "other"
-            self._trace(line, colour, legend)
+        self._annotate(_label(panel), x[0], y[1])
+        for line, colour in zip(panel.lines, panel.colours, strict=True):
+            self._trace(line, colour)
 
-    def add_strip(self, panel: Panel, x: tuple[float, float], y: tuple[float, float], lowest: bool) -> None:
-        """Add a panel's strip in its domain."""
-        if panel.strip is None:
-            return
+    def add_strip(
+        self, panel: Panel, strip: Line, x: tuple[float, float], y: tuple[float, float], lowest: bool
+    ) -> None:
+        """Add the strip of a panel in its domain."""
         self._axes(x, y, lowest, {"nticks": 5, "tickfont": {"size": 10}})
-        self._label(escape(panel.strip_label), x[0], y[1], size=10)
-        self._trace(panel.strip, COLOURS["error"], None)
+        self._annotate(escape(panel.strip_label), x[0], y[1], size=10)
+        self._trace(strip, COLOURS["error"])
 
     def _axes(
         self, x: tuple[float, float], y: tuple[float, float], lowest: bool, vertical: dict[str, Any]
@@ -108,11 +112,12 @@ class _Drawing:
         self.layout[f"xaxis{n}"] = common | horizontal
         self.layout[f"yaxis{n}"] = common | {"domain": list(y), "anchor": f"x{n}"} | vertical
 
-    def _label(self, text: str, x: float, y: float, size: int = 12) -> None:
-        """Add a label above axes, at their left."""
+    def _annotate(self, text: str, x: float, y: float, size: int = 12) -> None:
+        """Add text above axes, at their left."""
         self.layout["annotations"].append(
             {
-                "text": text.strip(),
+                "text": text,
+                "align": "left",
                 "x": x,
                 "y": y,
                 "xref": "paper",
@@ -124,23 +129,8 @@ class _Drawing:
             }
         )
 
-    def _legend(self, x: float, y: float) -> str:
-        """Add a legend above axes, at their right."""
-        self.legends += 1
-        name = f"legend{self.legends if self.legends > 1 else ''}"
-        self.layout[name] = {
-            "x": x,
-            "y": y,
-            "xanchor": "right",
-            "yanchor": "bottom",
-            "orientation": "h",
-            "font": {"size": 11},
-            "bgcolor": "rgba(0,0,0,0)",
-        }
-        return name
-
-    def _trace(self, line: Line, colour: str, legend: str | None) -> None:
-        """Add a line to the axes added last."""
+    def _trace(self, line: Line, colour: str) -> None:
+        """Add a line to the axes added last; what is in common is named once and shown or hidden together."""
         kept = decimate(line.y, self.most)
         n = self.axes if self.axes > 1 else ""
         trace: dict[str, Any] = {
@@ -151,7 +141,7 @@ class _Drawing:
             "xaxis": f"x{n}",
             "yaxis": f"y{n}",
             "name": escape(line.label or "value"),
-            "showlegend": bool(line.label) and legend is not None,
+            "showlegend": _in_legend(line) and line.label not in self.named,
             "line": {
                 "color": colour,
                 "width": 2 if line.role in ("model", "reference") else 1.3,
@@ -161,8 +151,9 @@ class _Drawing:
             "marker": {"size": 3, "color": colour},
             "hoverinfo": "skip" if line.role == "bound" else "all",
         }
-        if legend is not None:
-            trace["legend"] = legend
+        if _in_legend(line):
+            trace["legendgroup"] = line.role
+            self.named.add(line.label)
         self.data.append(trace)
 
 
@@ -178,11 +169,36 @@ def packed(values: NDArray[np.float64], kind: str) -> dict[str, str]:
     return {"dtype": kind, "bdata": base64.b64encode(little_endian.tobytes()).decode("ascii")}
 
 
+def _decades(panel: Panel) -> dict[str, Any]:
+    """A logarithmic axis with about six labels."""
+    values = np.concatenate([line.y for line in panel.lines])
+    known = values[values > 0]
+    decades = float(np.log10(known.max() / known.min())) if known.size else 1.0
+    return {"type": "log", "dtick": max(1, round(decades / 6))}
+
+
 def _strip(row: tuple[Panel, ...]) -> int:
     """Height that strips need in a row."""
     return STRIP + STRIP_HEADER if any(panel.strip for panel in row) else 0
 
 
-def _own_lines(panel: Panel) -> int:
-    """Number of lines that only a panel's own legend names."""
-    return sum(line.role == "other" for line in panel.lines)
+def _in_legend(line: Line) -> bool:
+    """Whether a line is of those that panels have in common; others are named in the panel's label."""
+    return bool(line.label) and line.role != "other"
+
+
+def _label(panel: Panel) -> str:
+    """What stands above a panel: quantity, note, and in their colours the lines that are its own."""
+    rows, used = [f"<b>{escape(panel.label)}</b>"], len(panel.label)
+    if panel.note:
+        rows[-1] += f"&nbsp;&nbsp; {escape(panel.note)}"
+    for line, colour in zip(panel.lines, panel.colours, strict=True):
+        if line.role != "other":
+            continue
+        name = shortened(line.label)
+        used += len(name) + 3
+        if used > LABEL_WIDTH:
+            rows.append("")
+            used = len(name)
+        rows[-1] += f' &nbsp; <span style="color:{colour}">{escape(name)}</span>'
+    return "<br>".join(row.strip() for row in rows)

@@ -133,7 +133,7 @@ def _charts(drawn: Iterable[Chart], section: str) -> str:
         if SECTION_OF.get(chart.name, "control") == section:
             note = f'<p class="note">{escape(chart.note)}</p>' if chart.note else ""
             place = f'<div class="chart" id="{_chart_id(chart)}"></div>'
-            html.append(f"<h3>{escape(chart.title)}</h3>{place}{note}")
+            html.append(f"<figure><h3>{escape(chart.title)}</h3>{place}{note}</figure>")
     return "".join(html)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from results_helpers import (
     PROVENANCE,
@@ -22,7 +23,7 @@ from results_helpers import (
     write_trajectories,
 )
 
-from exlinn_fmi.data.files import read_json, write_json
+from exlinn_fmi.data.files import read_json, write_json, write_table
 from exlinn_fmi.results.interactive import packed
 from exlinn_fmi.results.metrics import control_metrics
 from exlinn_fmi.results.report import write_report
@@ -247,6 +248,32 @@ def test_names_in_charts_are_escaped_for_plotly(tmp_path: Path) -> None:
     names = [trace["name"] for trace in chart_data(folder)["chart-trajectories"]["data"]]
     assert "plant.&lt;b&gt;x" in names
     assert "plant.<b>x" in map(unescape, names)
+
+
+def test_lines_of_an_overview_are_named_in_their_colours_above_their_panel(tmp_path: Path) -> None:
+    folder = make_run(tmp_path, simulate=True)
+    names = [f"plant.a_rather_long_name_of_a_variable_number_{k}" for k in range(3)]
+    write_table(
+        folder / "trajectories", pd.DataFrame(np.eye(3), columns=names).assign(time=[0.0, 1.0, 2.0]), {}
+    )
+    figure = chart_data(folder)["chart-trajectories"]
+    (label,) = [a["text"] for a in figure["layout"]["annotations"]]
+    for name, trace in zip(names, figure["data"], strict=True):
+        assert f'<span style="color:{trace["line"]["color"]}">{name}</span>' in label
+    assert label.count("<br>") == 2
+    assert not any(trace["showlegend"] for trace in figure["data"])
+
+
+def test_what_all_panels_have_in_common_is_named_once(whole: Path) -> None:
+    traces = chart_data(whole)["chart-fig3_learning"]["data"]
+    assert [t["name"] for t in traces if t["showlegend"]] == ["measured", "learned"]
+    assert {t["legendgroup"] for t in traces if t["name"] == "learned"} == {"model"}
+
+
+def test_logarithmic_axes_have_few_labels(whole: Path) -> None:
+    axis = chart_data(whole)["chart-training"]["layout"]["yaxis"]
+    assert axis["type"] == "log"
+    assert axis["dtick"] == 2
 
 
 # ── words and numbers ────────────────────────────────────────────────────────────────────────────────────
