@@ -1,0 +1,212 @@
+"""Inverting a Lagrangian system along the trajectory of one coordinate: which state and input follow it?
+
+**Flat.** The rows of the inverse model (17) without input must vanish. Given the referenced coordinate and
+its derivatives they are equations for the other coordinates: for their velocities where those are cyclic (the
+current of a motor), for their positions where not (the charge of an actuator). Where there are as many of
+these equations as unknowns z, and they contain no derivative of z, the coordinate is a flat output: z follows
+by Newton's method, ż and z̈ by implicit differentiation, exactly, and the rows with input give u.
+
+**Steady.** Any other system is given a rest for each value of the reference: accelerations 0, velocities of
+the other coordinates 0 save those of cyclic ones; what remains unknown, with the input, is fitted by least
+squares, near the starting point where it is not determined.
+
+Reference: M. Fliess, J. Lévine, P. Martin, P. Rouchon, Flatness and defect of non-linear systems, Int. J.
+Control 61 (1995).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Bool, Float
+
+from exlinn_fmi.control.batch import Batch
+from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, Symbol
+
+ORDERS = 4
+"""Highest derivative of the referenced position that an inversion may use."""
+
+
+@dataclass(frozen=True)
+class Inversion:
+    """Equations r(y, z) = 0 for the unknowns z at one instant, and what follows from them.
+
+    Args:
+        flat: whether the whole state and input follow exactly; if not, they are those of a rest.
+        reason: why so, in a sentence.
+        equations: (y, z) → (r, ∂r/∂z), with y = (q_c, q̇_c, …, up to ORDERS).
+        completion: (y, z) → (x, u).
+        unknowns: how z reads off a state x and input u: indices into (x, u).
+    """
+
+    flat: bool
+    reason: str
+    equations: ca.Function
+    completion: ca.Function
+    unknowns: tuple[int, ...]
+
+
+def invert(system: LagrangianSystem, coordinate: int, velocity: bool) -> Inversion:
+    """The best inversion there is for a system and the coordinate that is to follow a reference.
+
+    Args:
+        system: the model.
+        coordinate: index of the coordinate.
+        velocity: whether its velocity is referenced rather than its position.
+    """
+    found = _flat(system, coordinate)
+    return found if isinstance(found, Inversion) else _steady(system, coordinate, velocity, found)
+
+
+def _flat(system: LagrangianSystem, c: int) -> Inversion | str:
+    """The inversion of a flat system, or the reason why it is none."""
+    n = system.n
+    others = [i for i in range(n) if i != c]
+    driven = [i for i in range(n) if system.coordinates[i].input is not None]
+    free = [i for i in range(n) if i not in driven]
+    if len(free) != len(others):
+        return f"{len(free)} equations without input do not determine {len(others)} other coordinates"
+    cyclic = {system.coordinates[i].topology == "cyclic" for i in others}
+    if len(cyclic) > 1:
+        return "some of the other coordinates are cyclic and some are not"
+    level = 1 if cyclic == {True} else 0  # which derivative of the other coordinates is the unknown z
+
+    y = ca.SX.sym("y", ORDERS + 1)
+    z = [ca.SX.sym(f"z{k}", len(others)) for k in range(3)]  # z, ż, z̈
+    motion = [ca.SX.zeros(n) for _ in range(3)]  # q, q̇, q̈
+    for k in range(3):
+        motion[k][c] = y[k]
+        if k >= level:
+            for j, i in enumerate(others):
+                motion[k][i] = z[k - level][j]
+    force = system.inverse(*motion, system.parameter_values)
+    equations = force[free]
+    if others and ca.depends_on(equations, ca.vertcat(z[1], z[2])):
+        return "the equations without input contain derivatives of the other coordinates"
+    jacobian = ca.jacobian(equations, z[0])
+    if ca.sprank(jacobian) < len(others):
+        return "the equations without input do not contain the other coordinates"
+
+    # d/dt r(y, z) = 0 and d²/dt² r(y, z) = 0 are linear in ż and z̈, with the same matrix ∂r/∂z.
+    rate = ca.vertcat(y[1:], 0)
+    drift = ca.jtimes(equations, y, rate)
+    z1 = -ca.solve(jacobian, drift) if others else z[1]
+    slope = drift + jacobian @ z[1]
+    curvature = ca.jtimes(slope, y, rate) + ca.jtimes(slope, z[0], z[1])
+    z2 = -ca.solve(jacobian, curvature) if others else z[2]
+    z2 = ca.substitute(z2, z[1], z1)
+    x = _state(system, motion[0], motion[1])
+    u = force[driven]
+    x, u = ca.substitute([x, u], [z[2]], [z2])
+    x, u = ca.substitute([x, u], [z[1]], [z1])
+    kept = system.state_names
+    names = [system.coordinates[i].velocity if level else system.coordinates[i].name for i in others]
+    return Inversion(
+        True,
+        "the referenced coordinate is a flat output of the model",
+        ca.Function("equations", [y, z[0]], [ca.densify(equations), ca.densify(jacobian)]),
+        _completion(y, z[0], x, u),
+        tuple(kept.index(name) for name in names),
+    )
+
+
+def _steady(system: LagrangianSystem, c: int, velocity: bool, reason: str) -> Inversion:
+    """The inversion that gives a rest for each value of the reference."""
+    n, kept, m = system.n, system.state_names, len(system.input_names)
+    y, q, v = ca.SX.sym("y", ORDERS + 1), ca.SX.zeros(n), ca.SX.zeros(n)
+    q[c] = y[0]
+    if velocity:
+        v[c] = y[1]
+    unknown: list[Symbol] = []
+    names: list[str] = []
+    for i, coordinate in enumerate(system.coordinates):
+        if i == c:
+            continue
+        symbol = ca.SX.sym(coordinate.name)
+        cyclic = coordinate.topology == "cyclic"
+        (v if cyclic else q)[i] = symbol
+        unknown.append(symbol)
+        names.append(coordinate.velocity if cyclic else coordinate.name)
+    u = ca.SX.sym("u", m)
+    z = ca.vertcat(*unknown, u)
+    residual = system.inverse(q, v, ca.SX.zeros(n), system.parameter_values) - system.input_matrix @ u
+    return Inversion(
+        False,
+        f"steady references: {reason}",
+        ca.Function("equations", [y, z], [ca.densify(residual), ca.densify(ca.jacobian(residual, z))]),
+        _completion(y, z, _state(system, q, v), u),
+        (*(kept.index(name) for name in names), *(len(kept) + k for k in range(m))),
+    )
+
+
+def _state(system: LagrangianSystem, q: Symbol, v: Symbol) -> Symbol:
+    """The state column of positions and velocities."""
+    kept = [i for i, c in enumerate(system.coordinates) if c.topology != "cyclic"]
+    return ca.vertcat(q[kept], v)
+
+
+def _completion(y: Symbol, z: Symbol, x: Symbol, u: Symbol) -> ca.Function:
+    return ca.Function("completion", [y, z], ca.cse([ca.densify(x), ca.densify(u)]))
+
+
+class Inverter:
+    """Solves an inversion at a fixed number of instants at once.
+
+    Args:
+        inversion: what to solve.
+        count: number of instants.
+    """
+
+    ITERATIONS = 30
+    TOLERANCE = 1e-11
+
+    def __init__(self, inversion: Inversion, count: int) -> None:
+        self._flat = inversion.flat
+        self._equations = Batch(inversion.equations, count)
+        self._completion = Batch(inversion.completion, count)
+
+    def __call__(
+        self, y: Float[np.ndarray, "k o"], guess: Float[np.ndarray, "k z"]
+    ) -> tuple[Float[np.ndarray, "k z"], Float[np.ndarray, "k x"], Float[np.ndarray, "k u"]]:
+        """Unknowns, states and inputs along the trajectory.
+
+        Args:
+            y: referenced position and its derivatives, shape (count, ORDERS + 1).
+            guess: start of the iteration, shape (count, unknowns).
+
+        Returns:
+            z, x and u; where there is no solution z is the guess, and nothing is ever infinite or NaN.
+        """
+        z, solved = self._solve(y, guess)
+        if not solved.all():
+            # A guess at rest can be a singular point (force ∝ i² at i = 0): try from a generic one.
+            again, more = self._solve(y, np.ones_like(guess))
+            z = np.where((more & ~solved)[:, None], again, np.where(solved[:, None], z, guess))
+        x, u = (np.nan_to_num(r[:, :, 0], nan=0.0, posinf=0.0, neginf=0.0) for r in self._completion(y, z))
+        return z, x, u
+
+    def _solve(
+        self, y: Float[np.ndarray, "k o"], guess: Float[np.ndarray, "k z"]
+    ) -> tuple[Float[np.ndarray, "k z"], Bool[np.ndarray, " k"]]:
+        """Gauss–Newton with steps of least norm, and where it ended in a solution."""
+        z = guess.copy()
+        converged = np.full(len(z), z.shape[1] == 0)
+        for _ in range(self.ITERATIONS):
+            if converged.all():
+                break
+            result, jacobian = self._equations(y, z)
+            residual = result[:, :, 0]
+            usable = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
+            if not usable.any():
+                break
+            step = np.zeros_like(z)
+            step[usable] = -np.einsum("kij,kj->ki", np.linalg.pinv(jacobian[usable]), residual[usable])
+            z += step
+            converged = usable & (np.abs(step).max(axis=1) <= self.TOLERANCE * (1.0 + np.abs(z).max(axis=1)))
+        if self._flat and z.shape[1]:
+            # A step of 0 at a singular point solves nothing.
+            residual, _ = self._equations(y, z)
+            converged &= np.abs(residual).max(axis=(1, 2)) <= 1e-7 * (1.0 + np.abs(y).max(axis=1))
+        return z, converged
