@@ -20,7 +20,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from exlinn_fmi.errors import InputError, Interrupted, RunError, nearest
 if TYPE_CHECKING:
     import pandas as pd
 
-Algorithm = Literal["jacobi", "gauss-seidel"]
+ALGORITHMS = ("jacobi", "gauss-seidel")
 Progress = Callable[[float, float], None]
 
 REPORT_EVERY = 0.1
@@ -84,7 +84,7 @@ class Master:
         stop: float,
         step: float,
         own_steps: Mapping[str, float] | None = None,
-        algorithm: Algorithm = "jacobi",
+        algorithm: str = "jacobi",
         record: Sequence[str] = ("*",),
         profile: bool = False,
     ) -> None:
@@ -93,6 +93,9 @@ class Master:
         own_steps = own_steps or {}
         _check_names(graph, "own step", own_steps)
         self.every = [count_every(name, own_steps.get(name, step), step) for name in graph.names]
+        if algorithm not in ALGORITHMS:
+            hint = nearest(algorithm, ALGORITHMS, "algorithms")
+            raise InputError(f"algorithm: there is no {algorithm!r}; {hint}")
         self._seidel = algorithm == "gauss-seidel"
         self.recorded = select(graph.components, record)
         self._profile = profile
@@ -103,7 +106,9 @@ class Master:
         progress: Progress | None = None,
         should_stop: Callable[[], bool] | None = None,
     ) -> Trajectories:
-        """Run from start to stop and close all components.
+        """Run from start to stop and close all components, whatever happens.
+
+        Runs are alike to the last bit; a second one needs components that can be entered after `close`.
 
         Args:
             starts: start values by component and variable.
@@ -166,6 +171,8 @@ class Master:
         except RunError as error:
             return error
         except KeyboardInterrupt:
+            if should_stop is not None and should_stop():
+                raise  # asked for the second time: at once
             return Interrupted("stopped by the user; the rows so far are kept")
         return None
 

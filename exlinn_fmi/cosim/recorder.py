@@ -95,6 +95,5 @@ class Recorder:
         """The filled rows as a frame."""
         import pandas as pd
 
-        # A run that ended early must not hold the memory of the whole.
-        table = self.table if self.rows == len(self.table) else self.table[: self.rows].copy()
-        return pd.DataFrame(table, columns=self.names)
+        # A copy has its columns in one piece each, and does not hold the memory of a run that ended early.
+        return pd.DataFrame(self.table[: self.rows], columns=self.names, copy=True)

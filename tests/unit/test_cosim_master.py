@@ -177,6 +177,13 @@ def test_two_runs_are_identical():
     assert first.frame.to_numpy().tobytes() == second.frame.to_numpy().tobytes()
 
 
+def test_unknown_algorithm_is_refused():
+    with pytest.raises(
+        InputError, match=r"algorithm: there is no 'gauss_seidel'; did you mean 'gauss-seidel'\?"
+    ):
+        run([Integrator("a")], algorithm="gauss_seidel")
+
+
 def test_start_values_reach_their_components():
     result = run([Integrator("a"), Integrator("b")], starts={"b": {"y": 4.0, "u": 2.0}}, stop=0.1)
     assert column(result, "b.y").tolist() == [4.0, 4.2]
@@ -409,6 +416,19 @@ def test_interrupt_inside_a_component_keeps_the_rows_so_far():
     result = faulty_run("step", interrupt, at=0.5)
     assert isinstance(result.error, Interrupted)
     assert len(result.frame) == 6
+
+
+def test_second_interrupt_ends_the_run_at_once_with_all_closed():
+    asked = []
+
+    def interrupt(component: Faulty) -> Status:
+        asked.append(True)
+        raise KeyboardInterrupt
+
+    plant = Faulty("a", "step", interrupt, at=0.5)
+    with pytest.raises(KeyboardInterrupt):
+        Master(graph([plant]), 0.0, 1.0, 0.1).run(should_stop=lambda: bool(asked))
+    assert plant.closed == 1
 
 
 def test_stop_request_after_the_last_row_changes_nothing():
