@@ -116,11 +116,11 @@ def test_missing_table_is_said_with_its_path(tmp_path: Path):
         files.read_table(tmp_path / "nothing")
 
 
-@pytest.mark.parametrize("content", [b"", b"PAR1 nonsense", b"a,b\n1\n"])
-@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+@pytest.mark.parametrize(
+    ("suffix", "content"),
+    [(".parquet", b""), (".parquet", b"PAR1 nonsense"), (".csv", b""), (".csv", b"a,b\n1\n")],
+)
 def test_damaged_table_is_a_data_error(tmp_path: Path, suffix: str, content: bytes):
-    if suffix == ".csv" and content.startswith(b"PAR1"):
-        pytest.skip("a header without rows is a CSV file")
     (tmp_path / f"t{suffix}").write_bytes(content)
     with pytest.raises(DataError, match=rf"t\{suffix}: cannot be read as a table \(.*\); make it again"):
         files.read_table(tmp_path / "t")
