@@ -85,6 +85,9 @@ def perform(work: Callable[[Run], object], file: Path, out: Path | None, overrid
         run = Run.open(file, out, overrides or (), terminal)
         with run.stop:
             work(run)
+    except KeyboardInterrupt:
+        # Caught here since Typer has an answer of its own to it.
+        raise Interrupted("stopped at once by a second Ctrl-C; files that were complete are kept") from None
     finally:
         terminal.close()
     return run
@@ -282,8 +285,6 @@ def exit_code(arguments: list[str] | None = None) -> int:
     except UsageError as error:
         error.show()
         return 1
-    except (KeyboardInterrupt, typer.Abort):
-        return fail(Interrupted("stopped at once by a second Ctrl-C; files that were complete are kept"))
     except ExlinnError as error:
         return fail(error)
     except OSError as error:
