@@ -8,7 +8,7 @@ from pathlib import Path
 
 from exlinn_fmi.components.base import Variable
 from exlinn_fmi.errors import DataError, ModelError
-from exlinn_fmi.mechanics.coordinates import Coordinate
+from exlinn_fmi.mechanics.coordinates import Coordinate, check_coordinates
 from exlinn_fmi.scenario.check_graph import is_multiple, misfit_starts, no_multiple
 from exlinn_fmi.scenario.explain import Finding
 from exlinn_fmi.scenario.schema import (
@@ -29,7 +29,7 @@ from exlinn_fmi.scenario.schema import (
     Structured,
     Table,
 )
-from exlinn_fmi.scenario.survey import Survey
+from exlinn_fmi.scenario.survey import Role, Survey
 from exlinn_fmi.scenario.units import same_unit
 from exlinn_fmi.scenario.words import KeyPath, suggestion
 
@@ -73,25 +73,49 @@ def learning(survey: Survey) -> Iterator[Finding]:
     learn = survey.scenario.learn
     if learn is None:
         return
-    plant = survey.scenario.components.get(learn.plant)
-    if learn.plant not in survey.names and not survey.sound.in_doubt((), "components"):
-        hint = suggestion(learn.plant, survey.names, "components")
-        yield ("learn", "plant"), f"there is no component {learn.plant!r}{hint}"
-    if isinstance(plant, SignalComponent | NmpcComponent):
-        kind = "a signal source" if isinstance(plant, SignalComponent) else "a controller"
-        yield ("learn", "plant"), f"{learn.plant} is {kind}, nothing that can be learned"
-    if isinstance(plant, ModelComponent) and plant.model == "learned":
-        yield ("learn", "plant"), f"{learn.plant} is what is learned here; name the component to learn from"
-    for k, spec in enumerate(learn.coordinates):
-        yield from _coordinate(("learn", "coordinates", k), spec, learn.plant, survey)
+    problem = _wrong_plant(learn, survey)
+    if problem:
+        yield ("learn", "plant"), problem
+    plant = None if problem else learn.plant
+    found = [f for k, c in enumerate(learn.coordinates) for f in _coordinate(k, c, plant, survey)]
+    yield from found
+    if not found:
+        try:
+            check_coordinates(tuple(c.coordinate() for c in learn.coordinates))
+        except ModelError as error:
+            yield ("learn", "coordinates"), str(error)
     for at, experiment in _experiments(learn):
-        yield from _experiment(at, experiment, survey, learn)
+        yield from _experiment(at, experiment, plant, survey)
     yield from _monomials(learn, survey.coordinates)
 
 
-def _coordinate(at: KeyPath, spec: CoordinateSpec, plant: str, survey: Survey) -> Iterator[Finding]:
+def _wrong_plant(learn: Learn, survey: Survey) -> str | None:
+    """Why the component to learn cannot be that, None where it can."""
+    name, plant = learn.plant, survey.scenario.components.get(learn.plant)
+    if name not in survey.names and survey.names_are_known:
+        return f"there is no component {name!r}{suggestion(name, survey.names, 'components')}"
+    if isinstance(plant, SignalComponent):
+        return f"{name} is a signal source; name the component to learn from"
+    if isinstance(plant, NmpcComponent):
+        return f"{name} is a controller; name the component to learn from"
+    if isinstance(plant, ModelComponent) and plant.model == "learned":
+        return f"{name} is the model that is learned; name the component to learn from"
+    owners = {c.velocity.split(".", 1)[0] for c in learn.coordinates}
+    if len(owners) == 1 and name not in owners:
+        return f"{name} has none of the coordinates' variables, they are of {owners.pop()}"
+    return None
+
+
+def _coordinate(k: int, spec: CoordinateSpec, plant: str | None, survey: Survey) -> Iterator[Finding]:
     """Plant variables of a coordinate that are not there, or not what they are said to be."""
-    whole = spec.coordinate()
+    at: KeyPath = ("learn", "coordinates", k)
+    in_doubt = any(path[:3] == at for path in survey.sound.cut)
+    if spec.position is None and spec.topology != "cyclic" and not in_doubt:
+        yield (
+            at,
+            f"missing key 'position': the plant variable that is {spec.name}; only a cyclic one has none",
+        )
+    whole, unit_is_wrong = spec.coordinate(), False
     ends = (
         ("position", spec.position, whole.unit, "unit"),
         ("velocity", spec.velocity, whole.velocity_unit, "velocity_unit"),
@@ -105,22 +129,23 @@ def _coordinate(at: KeyPath, spec: CoordinateSpec, plant: str, survey: Survey) -
         if problem is not None:
             yield (*at, key), problem
         elif variable is not None and not same_unit(unit, variable.unit):
-            hint = "" if key == "acceleration" else f"; say `{unit_key}: {variable.unit}`"
-            yield (
-                (*at, key),
-                f"unit mismatch: {spec.name} has {key} [{unit}], {path} is [{variable.unit}]{hint}",
-            )
+            if key == "input" or not unit_is_wrong:  # the units of derivatives follow from the one before
+                message = f"unit mismatch: {spec.name} has {key} [{unit}], {path} is [{variable.unit}]"
+                yield (*at, key), f"{message}; say `{unit_key}: {variable.unit}`"
+            unit_is_wrong = True
 
 
-def _plant_variable(path: str, plant: str, survey: Survey, role: str) -> tuple[Variable | None, str | None]:
-    """A variable of the plant to learn, or what is wrong with it."""
+def _plant_variable(
+    path: str, plant: str | None, survey: Survey, role: Role
+) -> tuple[Variable | None, str | None]:
+    """A variable of the plant to learn (None where that is not known), or what is wrong with it."""
     component, name = path.split(".", 1)
-    if component != plant and component in survey.names:
+    if plant is not None and component != plant and component in survey.names:
         return None, f"{path} is no variable of the plant to learn; write {plant}.{name}"
-    variable, problem = survey.find(path, "input" if role == "input" else "output")
+    variable, problem = survey.find(path, role)
     if variable is not None and (variable.causality == "input") != (role == "input"):
         found = "an input" if variable.causality == "input" else "no input"
-        problem = f"{path} is {found}; expected an {role} of {plant}"
+        problem = f"{path} is {found}; expected an {role}"
     return variable, problem
 
 
@@ -130,24 +155,21 @@ def _experiments(learn: Learn | None) -> Iterator[tuple[KeyPath, Experiment]]:
             yield from ((("learn", section, k), experiment) for k, experiment in enumerate(experiments))
 
 
-def _experiment(at: KeyPath, experiment: Experiment, survey: Survey, learn: Learn) -> Iterator[Finding]:
-    """An experiment whose steps, inputs or start values do not fit the plant."""
-    if experiment.step > experiment.duration:
-        yield (
-            (*at, "step"),
-            f"the step, {experiment.step:g} s, is longer than the run, {experiment.duration:g} s",
-        )
-    plant = survey.scenario.components.get(learn.plant)
-    if plant is not None and plant.step is not None and not is_multiple(plant.step, experiment.step):
-        message = no_multiple(plant.step, experiment.step, "the experiment's step")
-        yield (*at, "step"), f"{learn.plant} has a step of its own: {message}"
+def _experiment(at: KeyPath, experiment: Experiment, plant: str | None, survey: Survey) -> Iterator[Finding]:
+    """An experiment whose step, inputs or start values do not fit the plant (None where not known)."""
+    step, doubt = experiment.step, survey.sound.in_doubt(at, "step")
+    if step > experiment.duration and not doubt:
+        yield (*at, "step"), f"the step, {step:g} s, is longer than the run, {experiment.duration:g} s"
+    spec, simulate = survey.scenario.components.get(plant or ""), survey.scenario.simulate
+    told = doubt or (simulate is not None and simulate.step == step)  # where the component's step stands
+    if spec is not None and spec.step is not None and not told and not is_multiple(spec.step, step):
+        message = no_multiple(spec.step, step, "the experiment's step")
+        yield (*at, "step"), f"{plant} has a step of its own: {message}"
     modelled = [c.input for c in survey.coordinates if c.input]
     for target, signal in experiment.inputs.items():
-        variable, problem = _plant_variable(target, learn.plant, survey, "input")
+        variable, problem = _plant_variable(target, plant, survey, "input")
         if problem is None and modelled and target.split(".", 1)[1] not in modelled:
-            problem = (
-                f"{target} is driven, but no coordinate has it as `input`: the model would not know of it"
-            )
+            problem = f"{target} is driven, but is `input` of no coordinate: the model would not know of it"
         if problem is not None:
             yield (*at, "inputs", target), problem
         elif variable is not None and not same_unit(signal.unit, variable.unit):
@@ -155,9 +177,9 @@ def _experiment(at: KeyPath, experiment: Experiment, survey: Survey, learn: Lear
                 (*at, "inputs", target),
                 f"unit mismatch: signal [{signal.unit}] → {target} [{variable.unit}]",
             )
-    known = survey.variables.get(learn.plant)
-    if known is not None:
-        yield from misfit_starts((*at, "start"), experiment.start, learn.plant, known)
+    known = survey.variables.get(plant or "")
+    if plant is not None and known is not None:
+        yield from misfit_starts((*at, "start"), experiment.start, plant, known)
 
 
 def _monomials(learn: Learn, coordinates: tuple[Coordinate, ...]) -> Iterator[Finding]:
@@ -199,7 +221,7 @@ def control(survey: Survey) -> Iterator[Finding]:
                 yield from _learned((*at, "nmpc", "model"), survey)
             known = survey.variables.get(name)
             states = inputs = None
-            if known is not None:
+            if known is not None and "reference" in known:
                 states = {v.name: v for v in known.values() if v.causality == "input"}
                 outputs = [v.name for v in known.values() if v.causality == "output"]
                 inputs = outputs[: outputs.index("reference")]

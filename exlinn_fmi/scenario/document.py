@@ -142,6 +142,8 @@ class _Reading:
             raise _TooManyValuesError
         if isinstance(node, ScalarNode):
             return self._scalar(node, path, line)
+        if str(node.tag) not in (f"{_TAG}map", f"{_TAG}seq"):
+            return self._fault(path, f"the tag {node.tag} has no meaning here; leave it out", line)
         if id(node) in self._open:
             return self._fault(path, "an alias stands within what it is an alias of", line)
         self._open.add(id(node))

@@ -42,6 +42,8 @@ def _plain(node: Any) -> Any:
         plain["title"] = _words(title)
     for value in plain.get("properties", {}).values():
         value.pop("title", None)  # pydantic makes it of the field's name and says nothing with it
+        if "const" in value:  # the key that says what a section is
+            value.setdefault("description", plain["description"])
     return plain
 
 

@@ -9,7 +9,6 @@ from typing import Any, get_args, get_origin
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
-from ruamel.yaml.error import YAMLError
 
 from exlinn_fmi.errors import Problem
 from exlinn_fmi.scenario.document import TextResolver, parse
@@ -69,10 +68,7 @@ def _value(text: str) -> Any:
     problems = parse(text).problems
     if problems:
         raise _UnfitError(problems[0].message)
-    try:
-        return _round_trip().load(text)
-    except YAMLError as error:  # what parses without resolving anything may still hold a key twice
-        raise _UnfitError(f"not YAML: {error}") from error
+    return _round_trip().load(text)
 
 
 def _set(document: Any, keys: list[str], value: Any) -> KeyPath:

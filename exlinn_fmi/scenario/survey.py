@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,11 +14,13 @@ from exlinn_fmi.scenario.derived import derived_variables
 from exlinn_fmi.scenario.explain import Finding, Sound, sound_part
 from exlinn_fmi.scenario.schema import (
     ComponentBase,
+    CoordinateSpec,
     FmuComponent,
     ModelComponent,
     NmpcComponent,
     PythonComponentSpec,
     Scenario,
+    SignalComponent,
     component_kind,
 )
 from exlinn_fmi.scenario.words import KeyPath, closest, listing, missing_file, suggestion
@@ -52,6 +54,11 @@ class Survey:
         """The part of the scenario without mistakes."""
         return self.sound.scenario
 
+    @property
+    def names_are_known(self) -> bool:
+        """Whether a name that is not among `names` is no component."""
+        return bool(self.names) and not self.sound.in_doubt((), "components")
+
     def find(self, path: str, role: Role) -> tuple[Variable | None, str | None]:
         """The variable that ``component.variable`` names.
 
@@ -64,7 +71,7 @@ class Survey:
         """
         component, name = path.split(".", 1)
         if component not in self.names:
-            if self.sound.in_doubt((), "components"):
+            if not self.names_are_known:
                 return None, None
             return (
                 None,
@@ -90,52 +97,74 @@ def survey(data: Any, folder: Path, inspect: Inspect | None) -> tuple[Survey, li
     sound = sound_part(data)
     components = data.get("components") if isinstance(data, dict) else None
     names = tuple(components) if isinstance(components, dict) else ()
-    coordinates, findings = _coordinates(sound)
-    variables: dict[str, dict[str, Variable]] = {}
+    variables: dict[str, Sequence[Variable]] = {}
+    findings: list[Finding] = []
     for name, spec in sound.scenario.components.items():
-        found: Sequence[Variable] | None = derived_variables(spec, coordinates)
         problems = list(_files(name, spec, folder))
         findings += problems
-        if found is None and not problems and inspect is not None and _settled(name, spec, sound):
+        if not problems and inspect is not None and _settled(name, spec, sound):
             try:
-                found = inspect(spec, folder)
+                variables[name] = inspect(spec, folder)
             except InputError as error:
                 message = "; ".join(str(error).splitlines())
                 findings.append((("components", name, component_kind(spec) or ""), message))
-        if found is not None:
-            variables[name] = {v.name: v for v in found}
-    return Survey(sound, folder, names, coordinates, variables), findings
+    coordinates = _coordinates(sound, variables)
+    for name, spec in sound.scenario.components.items():
+        if (derived := derived_variables(spec, coordinates)) is not None:
+            variables[name] = derived
+    by_name = {name: {v.name: v for v in found} for name, found in variables.items()}
+    return Survey(sound, folder, names, coordinates, by_name), findings
 
 
-def _coordinates(sound: Sound) -> tuple[tuple[Coordinate, ...], list[Finding]]:
-    """The coordinates to learn, unless a mistake in them leaves open what they are."""
-    learn, at = sound.scenario.learn, ("learn", "coordinates")
-    if learn is None or any(path[:2] == at for path in sound.cut):
-        return (), []
-    findings: list[Finding] = [
-        (
-            (*at, k),
-            f"missing key 'position': the plant variable that is {c.name}; only a cyclic coordinate has none",
+def _coordinates(sound: Sound, variables: Mapping[str, Sequence[Variable]]) -> tuple[Coordinate, ...]:
+    """The coordinates to learn, in the units that the plant states; none where there is a mistake in them."""
+    learn = sound.scenario.learn
+    if learn is None or any(path[:2] == ("learn", "coordinates") for path in sound.cut):
+        return ()
+    plant = {f"{learn.plant}.{v.name}": v for v in variables.get(learn.plant, ())}
+    if not all(_is_sound(spec, plant) for spec in learn.coordinates):
+        return ()
+
+    def unit(name: str | None, stated: str) -> str:
+        variable = plant.get(f"{learn.plant}.{name}")
+        return stated if variable is None or variable.unit is None else variable.unit
+
+    coordinates = tuple(
+        replace(
+            c,
+            unit=unit(c.name, c.unit),
+            velocity_unit=unit(c.velocity, c.velocity_unit),
+            input_unit=unit(c.input, c.input_unit),
         )
-        for k, c in enumerate(learn.coordinates)
-        if c.position is None and c.topology != "cyclic"
-    ]
-    coordinates = tuple(c.coordinate() for c in learn.coordinates)
+        for c in (spec.coordinate() for spec in learn.coordinates)
+    )
     try:
         check_coordinates(coordinates)
-    except ModelError as error:
-        findings.append((at, str(error)))
-    return (() if findings else coordinates), findings
+    except ModelError:
+        return ()
+    return coordinates
+
+
+def _is_sound(spec: CoordinateSpec, plant: Mapping[str, Variable]) -> bool:
+    """Whether the variables of a coordinate are there and can be what they are said to be."""
+    if spec.position is None and spec.topology != "cyclic":
+        return False
+    outputs = [path for path in (spec.position, spec.velocity, spec.acceleration) if path is not None]
+    return not plant or (
+        all(path in plant and plant[path].causality != "input" for path in outputs)
+        and (spec.input is None or (spec.input in plant and plant[spec.input].causality == "input"))
+    )
 
 
 def _settled(name: str, spec: ComponentBase, sound: Sound) -> bool:
-    """Whether a component is given well enough to look at, and needs no model that is still to be learned."""
+    """Whether a component must be looked at to know its variables, and is given well enough for that."""
     at: KeyPath = ("components", name)
     if isinstance(spec, NmpcComponent):
         return spec.nmpc.model != "learned" and not any(path[:2] == at for path in sound.cut)
     if isinstance(spec, PythonComponentSpec):
         return not sound.in_doubt(at, "options")
-    return not isinstance(spec, ModelComponent) or spec.model != "learned"
+    learned = isinstance(spec, ModelComponent) and spec.model == "learned"
+    return not learned and not isinstance(spec, SignalComponent)
 
 
 def _files(name: str, spec: ComponentBase, folder: Path) -> Iterator[Finding]:
@@ -161,4 +190,5 @@ def _model(name: str, at: KeyPath, folder: Path) -> Iterator[Finding]:
     if (folder / name).is_dir():
         yield at, f"no model in {name!r}: it has no model.json; give a folder that `exlinn train` wrote"
     else:
-        yield at, f"expected `learned` or a folder with a model.json; {missing_file(name, folder)}"
+        hint = "; did you mean 'learned'?" if closest(name, ["learned"]) else ""
+        yield at, f"expected `learned` or a folder with a model.json: {missing_file(name, folder)}{hint}"
