@@ -1,0 +1,332 @@
+"""Data sets: trajectories of coordinates, velocities, accelerations and inputs as one pandas frame.
+
+Columns: ``trajectory`` (int), ``time`` [s], positions that are not cyclic, velocities, accelerations,
+    inputs, all by their names in `Coordinate`; further columns (energies, …) may follow. Rows of a
+    trajectory stand together, in the order of time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike, NDArray
+
+from exlinn_fmi.data.derivatives import derivative
+from exlinn_fmi.data.files import read_json, read_table, write_json, write_table
+from exlinn_fmi.errors import DataError
+from exlinn_fmi.mechanics.coordinates import (
+    Coordinate,
+    check_coordinates,
+    input_names,
+    state_names,
+    state_units,
+)
+
+MINIMUM_ROWS = 20
+"""Fewest samples that a model is trained on."""
+
+
+class Samples(NamedTuple):
+    """q [unit of q], v = q̇, a = q̈ and generalised forces F, shape (N, n); cyclic q and absent F are 0."""
+
+    q: Float[NDArray[np.float64], "N n"]
+    v: Float[NDArray[np.float64], "N n"]
+    a: Float[NDArray[np.float64], "N n"]
+    F: Float[NDArray[np.float64], "N n"]
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Trajectories of a system; checked when made.
+
+    Args:
+        frame: the columns that the head of this module names; the index is 0, 1, 2, ….
+        coordinates: the generalised coordinates.
+        units: unit by column name; those of the coordinates are filled in.
+
+    Raises:
+        DataError: a column is missing or not numeric, a value is not finite, or time does not increase.
+    """
+
+    frame: pd.DataFrame
+    coordinates: tuple[Coordinate, ...]
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_coordinates(self.coordinates)
+        object.__setattr__(self, "units", coordinate_units(self.coordinates) | dict(self.units))
+        object.__setattr__(self, "frame", self.frame.reset_index(drop=True))
+        _check_columns(self.frame, required_columns(self.coordinates))
+        _check_time(self.frame)
+
+    @classmethod
+    def from_columns(
+        cls,
+        columns: Mapping[str, ArrayLike],
+        coordinates: tuple[Coordinate, ...],
+        units: Mapping[str, str] | None = None,
+    ) -> Dataset:
+        """A data set from arrays by name; velocities and accelerations that are not there are estimated.
+
+        Args:
+            columns: arrays of one length each; without ``trajectory`` all rows are one trajectory.
+            coordinates: the generalised coordinates.
+            units: unit by column name.
+
+        Raises:
+            DataError: lengths differ, or a column is missing that cannot be estimated.
+        """
+        arrays = {name: np.asarray(values) for name, values in columns.items()}
+        if "time" not in arrays:
+            raise DataError(f"data set: column 'time' is missing; found {', '.join(arrays) or 'no column'}")
+        rows = len(arrays["time"])
+        for name, values in arrays.items():
+            if values.shape != (rows,):
+                raise DataError(
+                    f"data set: column {name!r} has {len(values)} rows, expected {rows} as in 'time'"
+                )
+        frame = pd.DataFrame({"trajectory": np.zeros(rows, dtype=int), **arrays})
+        return cls(estimate_missing(frame, coordinates), coordinates, units or {})
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @cached_property
+    def arrays(self) -> Samples:
+        """The samples as arrays."""
+        shape = (len(self.frame), len(self.coordinates))
+        q, v, a, force = (np.zeros(shape) for _ in range(4))
+        for i, c in enumerate(self.coordinates):
+            if c.topology != "cyclic":
+                q[:, i] = self.frame[c.name]
+            v[:, i], a[:, i] = self.frame[c.velocity], self.frame[c.acceleration]
+            if c.input is not None:
+                force[:, i] = self.frame[c.input]
+        return Samples(q, v, a, force)
+
+    @property
+    def trajectories(self) -> list[int]:
+        """Numbers of the trajectories, in the order of the rows."""
+        return [int(k) for k in self.frame["trajectory"].unique()]
+
+    def select(self, trajectories: Iterable[int]) -> Dataset:
+        """The data set of some of the trajectories."""
+        chosen = self.frame["trajectory"].isin(list(trajectories))
+        return Dataset(self.frame[chosen], self.coordinates, self.units)
+
+
+def required_columns(coordinates: tuple[Coordinate, ...]) -> list[str]:
+    """Names of the columns that a data set has at least, in their order."""
+    accelerations = [c.acceleration for c in coordinates]
+    return ["trajectory", "time", *state_names(coordinates), *accelerations, *input_names(coordinates)]
+
+
+def coordinate_units(coordinates: tuple[Coordinate, ...]) -> dict[str, str]:
+    """Units of the required columns."""
+    units = {"trajectory": "1", "time": "s"}
+    units |= dict(zip(state_names(coordinates), state_units(coordinates), strict=True))
+    units |= {c.acceleration: c.acceleration_unit for c in coordinates}
+    return units | {c.input: c.input_unit for c in coordinates if c.input is not None}
+
+
+def split(dataset: Dataset, fraction: float, blocks: int, seed: int) -> tuple[Dataset, Dataset]:
+    """Divide a data set by blocks of time into one to fit and one to validate.
+
+    Each trajectory is cut into `blocks` blocks of equal length; blocks are drawn so that each trajectory
+    gives its share. Blocks that are neighbours stay one trajectory; the parts are numbered anew.
+
+    Args:
+        dataset: what to divide.
+        fraction: share of the blocks to fit, in (0, 1); at least one block goes to either side.
+        blocks: blocks per trajectory; one block in all is cut in two.
+        seed: seed of the draw.
+
+    Raises:
+        DataError: there are fewer than two samples.
+    """
+    if len(dataset) < 2:
+        raise DataError(
+            f"data set: found {len(dataset)} rows, expected at least 2 to split; record for longer"
+        )
+    rows = [np.flatnonzero(dataset.frame["trajectory"] == k) for k in dataset.trajectories]
+    pieces = max(blocks, 2) if len(rows) == 1 else blocks
+    cut = [[b for b in np.array_split(r, pieces) if len(b)] for r in rows]
+    random = np.random.default_rng(seed)
+    # Ranked draws, trajectory by trajectory: the first of each, then the second of each, …
+    drawn = sorted(
+        (rank + random.uniform(), t, int(b))
+        for t, parts in enumerate(cut)
+        for rank, b in enumerate(random.permutation(len(parts)))
+    )
+    count = min(max(round((1 - fraction) * len(drawn)), 1), len(drawn) - 1)
+    held = {(t, b) for _, t, b in drawn[:count]}
+    return _pick(dataset, cut, held, keep=False), _pick(dataset, cut, held, keep=True)
+
+
+def _pick(
+    dataset: Dataset, cut: list[list[Int[NDArray[np.intp], " _"]]], held: set[tuple[int, int]], keep: bool
+) -> Dataset:
+    """The blocks that are held (or not), numbered anew where rows are not consecutive."""
+    rows = np.concatenate(
+        [block for t, parts in enumerate(cut) for b, block in enumerate(parts) if ((t, b) in held) is keep]
+    )
+    frame = dataset.frame.iloc[rows].copy()
+    breaks = (np.diff(rows) != 1) | (np.diff(frame["trajectory"].to_numpy()) != 0)
+    frame["trajectory"] = np.concatenate([[0], np.cumsum(breaks)])
+    return Dataset(frame, dataset.coordinates, dataset.units)
+
+
+# ── missing columns ──────────────────────────────────────────────────────────────────────────────────────
+
+
+def estimate_missing(frame: pd.DataFrame, coordinates: tuple[Coordinate, ...]) -> pd.DataFrame:
+    """Fill in velocities from positions and accelerations from velocities, for each trajectory apart.
+
+    Args:
+        frame: with ``trajectory``, ``time`` and at least the positions, or the velocities where cyclic.
+        coordinates: the generalised coordinates.
+
+    Raises:
+        DataError: a column is missing that cannot be estimated, or a trajectory is too short for it.
+    """
+    frame = frame.copy()
+    _check_columns(frame, [c for c in ("trajectory", "time") if c in frame] or ["time"])
+    for c in coordinates:
+        source = [] if c.topology == "cyclic" else [c.name]
+        for target in (c.velocity, c.acceleration):
+            if target not in frame:
+                if not source:
+                    raise DataError(
+                        f"data set: column {target!r} is missing and cannot be estimated, because {c.name!r} "
+                        "is cyclic; record it"
+                    )
+                _check_columns(frame, source)
+                _check_time(frame)
+                order = 2 if target == c.acceleration and source[-1] == c.name else 1
+                frame[target] = _by_trajectory(frame, source[-1], order)
+            elif target == c.velocity:
+                source.append(target)
+    return frame
+
+
+def _by_trajectory(frame: pd.DataFrame, column: str, order: int) -> NDArray[np.float64]:
+    """Time derivative of a column, each trajectory apart."""
+    values = np.empty(len(frame))
+    for number in frame["trajectory"].unique():
+        rows = np.flatnonzero(frame["trajectory"] == number)
+        try:
+            values[rows] = derivative(
+                frame["time"].to_numpy(dtype=float)[rows], frame[column].to_numpy(dtype=float)[rows], order
+            )
+        except DataError as error:
+            raise DataError(f"data set: column {column!r} of trajectory {number}: {error}") from error
+    return values
+
+
+# ── checks ───────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _check_columns(frame: pd.DataFrame, names: list[str]) -> None:
+    """Refuse frames in which a column is missing, not numeric or not finite."""
+    for name in names:
+        if name not in frame:
+            raise DataError(
+                f"data set: column {name!r} is missing; found {', '.join(map(str, frame.columns))}"
+            )
+        if not pd.api.types.is_numeric_dtype(frame[name]):
+            raise DataError(f"data set: column {name!r} holds {frame[name].dtype}, expected numbers")
+        bad = np.flatnonzero(~np.isfinite(frame[name].to_numpy(dtype=float)))
+        if len(bad):
+            raise DataError(
+                f"data set: column {name!r}, row {bad[0]} (the first is 0): found "
+                f"{frame[name].iloc[bad[0]]}, expected a finite number; "
+                f"{len(bad)} such row{'s' * (len(bad) > 1)}: remove or repair them"
+            )
+
+
+def _check_time(frame: pd.DataFrame) -> None:
+    """Refuse trajectories in which time does not increase, or whose rows do not stand together."""
+    numbers, time = frame["trajectory"].to_numpy(), frame["time"].to_numpy(dtype=float)
+    same = numbers[1:] == numbers[:-1]
+    back = np.flatnonzero(same & (np.diff(time) <= 0))
+    if len(back):
+        row = int(back[0]) + 1
+        raise DataError(
+            f"data set: column 'time', row {row} (the first is 0): {time[row]:.9g} s after "
+            f"{time[row - 1]:.9g} s in trajectory {numbers[row]}; time must increase: sort the rows or give "
+            "the part a trajectory of its own"
+        )
+    starts = numbers[np.flatnonzero(np.concatenate([[True], ~same]))] if len(numbers) else numbers
+    again = np.flatnonzero(pd.Series(starts).duplicated())
+    if len(again):
+        raise DataError(
+            f"data set: column 'trajectory': the rows of trajectory {starts[again[0]]} do not stand "
+            "together; sort the rows by trajectory"
+        )
+
+
+def check_excitation(dataset: Dataset) -> None:
+    """Refuse data that no model can be trained on.
+
+    Raises:
+        DataError: too few samples, no input that varies, or a column that is constant although it is needed.
+    """
+    frame = dataset.frame
+    if len(frame) < MINIMUM_ROWS:
+        raise DataError(
+            f"data set: found {len(frame)} rows to train on, expected at least {MINIMUM_ROWS}; "
+            "record for longer"
+        )
+    constant = {name for name in required_columns(dataset.coordinates) if np.ptp(frame[name]) == 0}
+    for c in dataset.coordinates:
+        positions = [] if c.topology == "cyclic" else [c.name]
+        for name in (*positions, c.velocity, c.acceleration):
+            if name in constant:
+                raise DataError(
+                    f"data set: column {name!r} is {frame[name].iloc[0]:.9g} in all {len(frame)} rows, so "
+                    f"nothing can be learned of {c.name!r}; excite it, or leave the coordinate out"
+                )
+    inputs = input_names(dataset.coordinates)
+    if all(name in constant and frame[name].iloc[0] == 0 for name in inputs):
+        named = ", ".join(map(repr, inputs)) or "none is named"
+        raise DataError(
+            f"data set: no input acts in any row ({named}), so the scale of 𝓛 cannot "
+            "be learned; drive an input"
+        )
+
+
+# ── files ────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def save_dataset(folder: Path, dataset: Dataset) -> list[Path]:
+    """Write dataset.csv, dataset.parquet and dataset.meta.json (units, coordinates); return their paths.
+
+    Raises:
+        StorageError: one of them could not be written.
+    """
+    write_table(folder / "dataset", dataset.frame, dataset.units)
+    meta = folder / "dataset.meta.json"
+    write_json(meta, {"units": dataset.units, "coordinates": [asdict(c) for c in dataset.coordinates]})
+    return [folder / "dataset.csv", folder / "dataset.parquet", meta]
+
+
+def load_dataset(folder: Path) -> Dataset:
+    """Read what `save_dataset` wrote.
+
+    Raises:
+        DataError: a file is missing or does not hold a data set.
+    """
+    frame, units = read_table(folder / "dataset")
+    meta = folder / "dataset.meta.json"
+    try:
+        coordinates = tuple(Coordinate(**c) for c in read_json(meta)["coordinates"])
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{meta}: no coordinates can be read from it ({error}); collect again") from error
+    return Dataset(frame, coordinates, units)

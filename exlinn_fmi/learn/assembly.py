@@ -1,0 +1,149 @@
+"""What data contribute to the Euler–Lagrange equations of a structured model.
+
+With 𝓛 = Σ_t f_t(z(q)) μ_t(q̇), monomials μ of the velocities and network inputs z, (11) reads
+
+    d/dt ∂𝓛/∂q̇_k − ∂𝓛/∂q_k = Σ_t  f_t (∂²μ_t q̈)_k + (∂f_t/∂z · ż) ∂μ_t/∂q̇_k − μ_t ∂f_t/∂z · ∂z/∂q_k,
+
+linear in the values f_t and derivatives ∂f_t/∂z. The coefficients depend on data alone and are computed once;
+whatever represents the functions (networks, a basis for linear least squares) is applied to them. All
+quantities are dimensionless (`Scales`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from exlinn_fmi.data.dataset import Samples
+from exlinn_fmi.mechanics.coordinates import Coordinate
+from exlinn_fmi.mechanics.learned import ModelSpec, Scales, angular
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """Coefficients at B samples: r = weight (value · f + gradient · ∂f/∂z + (K − Kᵀ)q̇ + ∂D/∂q̇ − target).
+
+    Args:
+        z: network inputs (B, nz).
+        velocity: q̇ (B, n).
+        value: of each function f_t in each equation (B, n, T).
+        gradient: of each derivative ∂f_t/∂z_j in each equation (B, n, T, nz).
+        target: F (B, n).
+        weight: of each equation (n,), so that none drowns in another.
+    """
+
+    z: Float[Array, "B nz"]
+    velocity: Float[Array, "B n"]
+    value: Float[Array, "B n T"]
+    gradient: Float[Array, "B n T nz"]
+    target: Float[Array, "B n"]
+    weight: Float[Array, " n"]
+
+    def __len__(self) -> int:
+        return len(self.target)
+
+    def part(self, samples: slice) -> Assembly:
+        """Some of the samples."""
+        arrays = {f.name: getattr(self, f.name)[samples] for f in fields(self) if f.name != "weight"}
+        return Assembly(**arrays, weight=self.weight)
+
+    def chunks(self, size: int) -> Iterator[Assembly]:
+        """Parts of at most `size` samples, so that a Jacobian fits into the cache."""
+        return (self.part(slice(start, start + size)) for start in range(0, len(self), size))
+
+
+def data_scales(samples: Samples, coordinates: tuple[Coordinate, ...]) -> Scales:
+    """Units in which velocities, accelerations and powers are of size 1, whatever units the user has.
+
+    Time is that of change, rms(q̇)/rms(q̈) in the geometric mean; each position's unit makes its velocity's
+    rms 1; energy makes the largest input power 1.
+
+    Args:
+        samples: with velocities and accelerations that are not all 0, and at least one force.
+        coordinates: the generalised coordinates.
+    """
+    velocity, acceleration, force = (
+        np.sqrt(np.mean(x**2, axis=0)) for x in (samples.v, samples.a, samples.F)
+    )
+    time = float(np.exp(np.mean(np.log(velocity / acceleration))))
+    low, high = samples.q.min(axis=0), samples.q.max(axis=0)
+    line = np.array([c.topology == "line" for c in coordinates])
+    return Scales(
+        time=time,
+        energy=float(np.max(force * velocity)) * time,
+        position=tuple((velocity * time).tolist()),
+        centre=tuple(np.where(line, (high + low) / 2, 0.0).tolist()),
+        reach=tuple(np.where(line, (high - low) / 2, 1.0).tolist()),
+    )
+
+
+def inverse_assembly(spec: ModelSpec, samples: Samples, weight: Float[Array, " n"] | None = None) -> Assembly:
+    """Coefficients of the inverse model (17), the paper's residual: one row for each sample and equation.
+
+    Args:
+        spec: a structured model.
+        samples: the data, in the user's units.
+        weight: of each equation; 1 if not given.
+    """
+    assert spec.scales is not None
+    position, speed = np.array(spec.scales.position), spec.scales.velocity
+    w, a = samples.v / speed, samples.a * spec.scales.time / speed
+    z, slope = topology_features(spec, samples.q)
+    owners = spec.layout.owners
+    slope = slope * position[owners]  # ∂z/∂q̂
+    (rows, n), count, nz = w.shape, len(spec.layout.terms), len(owners)
+    value, gradient = np.zeros((rows, n, count)), np.zeros((rows, n, count, nz))
+    rate = slope * w[:, owners]  # ż
+    for t, term in enumerate(spec.layout.terms):
+        monomial, first, second = _velocity_monomial(term, w, a)
+        value[:, :, t] = second
+        gradient[:, :, t] = first[:, :, None] * rate[:, None]
+        for j, k in enumerate(owners):
+            gradient[:, k, t, j] -= monomial * slope[:, j]
+    target = samples.F / spec.scales.force
+    return Assembly(z, w, value, gradient, target, np.ones(n) if weight is None else weight)
+
+
+def _velocity_monomial(
+    term: tuple[str, int, int], w: Array, a: Array
+) -> tuple[Float[Array, " B"], Float[Array, "B n"], Float[Array, "B n"]]:
+    """μ, ∂μ/∂q̇ and ∂²μ/∂q̇² q̈ of a term of 𝓛."""
+    kind, i, j = term
+    first, second = np.zeros_like(w), np.zeros_like(w)
+    if kind == "V":
+        return -np.ones(len(w)), first, second
+    if kind == "A":
+        first[:, i] = 1
+        return w[:, i], first, second
+    if i == j:
+        first[:, i], second[:, i] = w[:, i], a[:, i]
+        return w[:, i] ** 2 / 2, first, second
+    first[:, i], first[:, j] = w[:, j], w[:, i]
+    second[:, i], second[:, j] = a[:, j], a[:, i]
+    return w[:, i] * w[:, j], first, second
+
+
+def topology_features(
+    spec: ModelSpec, q: Float[Array, "B n"]
+) -> tuple[Float[Array, "B nz"], Float[Array, "B nz"]]:
+    """Network inputs z(q) and the derivative of each with respect to its own coordinate."""
+    assert spec.scales is not None
+    z, slope = (np.empty((len(q), len(spec.layout.owners))) for _ in range(2))
+    k = 0
+    for i in spec.layout.positions:
+        if spec.coordinates[i].topology == "circle":
+            factor = angular(spec.coordinates[i])
+            z[:, k], z[:, k + 1] = np.sin(factor * q[:, i]), np.cos(factor * q[:, i])
+            slope[:, k], slope[:, k + 1] = factor * z[:, k + 1], -factor * z[:, k]
+            k += 2
+        else:
+            z[:, k] = (q[:, i] - spec.scales.centre[i]) / spec.scales.reach[i]
+            slope[:, k] = 1 / spec.scales.reach[i]
+            k += 1
+    return z, slope

@@ -1,0 +1,233 @@
+"""The structured networks in numpy: residual of the inverse model and its Jacobian, by hand.
+
+The residual is linear in values and derivatives of the functions of position (`assembly.py`), those are
+products of network outputs, and the outputs are linear in the basis [1, z, zz, tanh(Wz + b)]: four short
+chain rules.
+Shapes: B samples, n equations, T functions f, O outputs, H basis functions, nz network inputs, h hidden
+    units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from exlinn_fmi.learn.assembly import Assembly
+from exlinn_fmi.mechanics.learned import NARROWEST, Layout, ModelSpec, friction_width
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Forward:
+    """Values that residual and Jacobian share."""
+
+    basis: Float[Array, "B H"]
+    slopes: Float[Array, "B H nz"]
+    outputs: Float[Array, "B O"]
+    gradients: Float[Array, "B O nz"]
+    residual: Float[Array, "B n"]
+
+
+@dataclass(frozen=True)
+class StructuredNetworks:
+    """The structured form of `ModelSpec` as a function of one vector θ of its free weights."""
+
+    spec: ModelSpec
+
+    @cached_property
+    def _free(self) -> NDArray[np.bool_]:
+        """Which of all weights, one after the other, are in θ."""
+        return np.concatenate([mask.ravel() for mask in self.spec.layout.free.values()])
+
+    @property
+    def size(self) -> int:
+        """Number of free weights."""
+        return int(self._free.sum())
+
+    def unpack(self, theta: Float[Array, " P"]) -> dict[str, Array]:
+        """Weight arrays by name."""
+        full = np.zeros(self._free.shape)
+        full[self._free] = theta
+        weights, start = {}, 0
+        for name, shape in self.spec.layout.shapes.items():
+            size = int(np.prod(shape))
+            weights[name] = full[start : start + size].reshape(shape)
+            start += size
+        return weights
+
+    def pack(self, weights: dict[str, Array]) -> Float[Array, " P"]:
+        """θ of weight arrays."""
+        return np.concatenate([weights[name].ravel() for name in self.spec.layout.shapes])[self._free]
+
+    def pack_mask(self, masks: dict[str, NDArray[np.bool_]]) -> NDArray[np.bool_]:
+        """Which entries of θ are chosen by masks on the weight arrays."""
+        return np.concatenate([masks[name].ravel() for name in self.spec.layout.shapes])[self._free]
+
+    # ── values ───────────────────────────────────────────────────────────────────────────────────────────
+
+    def residual(self, theta: Float[Array, " P"], data: Assembly) -> Float[Array, "B n"]:
+        """Equations of motion less the forces in the data, in units of `Scales.force`, weighted."""
+        return self._forward(self.unpack(theta), data).residual
+
+    def functions(
+        self, weights: dict[str, Array], z: Float[Array, "B nz"]
+    ) -> tuple[Float[Array, "B T"], Float[Array, "B T nz"]]:
+        """The functions of position f_t and ∂f_t/∂z."""
+        basis, slopes = self._basis(weights, z)
+        return self._terms(*_outputs(weights, basis, slopes))
+
+    def _forward(self, weights: dict[str, Array], data: Assembly) -> _Forward:
+        basis, slopes = self._basis(weights, data.z)
+        outputs, gradients = _outputs(weights, basis, slopes)
+        f, df = self._terms(outputs, gradients)
+        residual = np.einsum("bnt,bt->bn", data.value, f) - data.target
+        residual += np.einsum("bntz,btz->bn", data.gradient, df)
+        residual += coupling_columns(self.spec.layout, data.velocity) @ weights["lagrangian.coupling"]
+        residual += weights["dissipation.viscous"] ** 2 * data.velocity
+        a, s = weights["dissipation.friction"], friction_width(weights)
+        residual += (a**2 * s * np.tanh(data.velocity[:, :, None] / s)).sum(axis=2)
+        return _Forward(basis, slopes, outputs, gradients, residual * data.weight)
+
+    def _basis(
+        self, weights: dict[str, Array], z: Float[Array, "B nz"]
+    ) -> tuple[Float[Array, "B H"], Float[Array, "B H nz"]]:
+        """[1, z, zz of lines, tanh(Wz + b)] and derivatives."""
+        layout = self.spec.layout
+        basis, slopes = product_basis(z, layout.products)
+        w = weights["lagrangian.hidden.weight"]
+        hidden = np.tanh(z @ w.T + weights["lagrangian.hidden.bias"])
+        return (
+            np.concatenate([basis, hidden], axis=1),
+            np.concatenate([slopes, (1 - hidden**2)[:, :, None] * w], axis=1),
+        )
+
+    def _terms(
+        self, outputs: Float[Array, "B O"], gradients: Float[Array, "B O nz"]
+    ) -> tuple[Float[Array, "B T"], Float[Array, "B T nz"]]:
+        """Functions f_t from outputs: M_ij = Σ_c L_ic L_jc + ε_i δ_ij; A and V are outputs themselves."""
+        layout, rows = self.spec.layout, self.spec.layout.rows
+        f = np.empty((len(outputs), len(layout.terms)))
+        df = np.empty((len(outputs), len(layout.terms), gradients.shape[2]))
+        for t, (kind, i, j) in enumerate(layout.terms):
+            if kind == "M":
+                left, right = outputs[:, rows[i]], outputs[:, rows[j]]
+                f[:, t] = (left * right).sum(axis=1) + (self.spec.epsilon[i] if i == j else 0.0)
+                df[:, t] = (left[:, :, None] * gradients[:, rows[j]]).sum(axis=1)
+                df[:, t] += (right[:, :, None] * gradients[:, rows[i]]).sum(axis=1)
+            else:
+                row = layout.outputs.index((kind, i, j))
+                f[:, t], df[:, t] = outputs[:, row], gradients[:, row]
+        return f, df
+
+    # ── derivatives ──────────────────────────────────────────────────────────────────────────────────────
+
+    def jacobian(
+        self, theta: Float[Array, " P"], data: Assembly
+    ) -> tuple[Float[Array, "B n"], Float[Array, "B n P"]]:
+        """Residual and its derivatives with respect to θ."""
+        weights, layout = self.unpack(theta), self.spec.layout
+        forward = self._forward(weights, data)
+        value, gradient = self._output_coefficients(forward, data)  # (B, n, O), (B, n, O, nz)
+        rows, n, count = value.shape
+        output = value[..., None] * forward.basis[:, None, None]  # (B, n, O, H)
+        for j in range(gradient.shape[3]):
+            output += gradient[..., j, None] * forward.slopes[:, None, None, :, j]
+        parts = [*self._hidden_columns(weights, forward, data, value, gradient)]
+        parts.append(output.reshape(rows, n, count * layout.basis))
+        parts += [coupling_columns(layout, data.velocity), *_dissipation_columns(weights, data)]
+        return forward.residual, np.concatenate(parts, axis=2)[:, :, self._free] * data.weight[:, None]
+
+    def _output_coefficients(
+        self, forward: _Forward, data: Assembly
+    ) -> tuple[Float[Array, "B n O"], Float[Array, "B n O nz"]]:
+        """Derivatives of the residual with respect to each output's value and gradient."""
+        layout, rows, (samples, n) = self.spec.layout, self.spec.layout.rows, data.target.shape
+        value = np.zeros((samples, n, len(layout.outputs)))
+        gradient = np.zeros((*value.shape, data.z.shape[1]))
+        for t, (kind, i, j) in enumerate(layout.terms):
+            by_value, by_gradient = data.value[:, :, t], data.gradient[:, :, t]
+            if kind != "M":
+                row = layout.outputs.index((kind, i, j))
+                value[:, :, row] += by_value
+                gradient[:, :, row] += by_gradient
+                continue
+            for one, other in ((rows[i], rows[j]), (rows[j], rows[i])):
+                partner = forward.outputs[:, None, other]
+                slope = np.einsum("bnz,bcz->bnc", by_gradient, forward.gradients[:, other])
+                value[:, :, one] += by_value[:, :, None] * partner + slope
+                gradient[:, :, one] += by_gradient[:, :, None] * partner[..., None]
+        return value, gradient
+
+    def _hidden_columns(
+        self,
+        weights: dict[str, Array],
+        forward: _Forward,
+        data: Assembly,
+        value: Float[Array, "B n O"],
+        gradient: Float[Array, "B n O nz"],
+    ) -> tuple[Float[Array, "B n W"], Float[Array, "B n h"]]:
+        """Columns of the hidden layer's weights and biases."""
+        h, (rows, n, _, nz) = self.spec.layout.hidden, gradient.shape
+        w = weights["lagrangian.hidden.weight"]
+        out = weights["lagrangian.output"][:, self.spec.layout.basis - h :]  # (O, h)
+        tanh = forward.basis[:, self.spec.layout.basis - h :]
+        first = 1 - tanh**2
+        by_slope = np.einsum("bnoz,oh->bnhz", gradient, out)
+        bias = np.einsum("bno,oh->bnh", value, out) * first[:, None]
+        bias -= np.einsum("bnhz,hz->bnh", by_slope, w) * (2 * tanh * first)[:, None]
+        weight = bias[..., None] * data.z[:, None, None] + by_slope * first[:, None, :, None]
+        return weight.reshape(rows, n, h * nz), bias
+
+
+def product_basis(
+    z: Float[Array, "B nz"], pairs: Sequence[tuple[int, int]]
+) -> tuple[Float[Array, "B H"], Float[Array, "B H nz"]]:
+    """[1, z, z_i z_j of the pairs] and their derivatives with respect to z."""
+    rows, nz = z.shape
+    basis = np.concatenate([np.ones((rows, 1)), z, *(z[:, [i]] * z[:, [j]] for i, j in pairs)], axis=1)
+    slopes = np.zeros((*basis.shape, nz))
+    slopes[:, 1 : 1 + nz] = np.eye(nz)
+    for k, (i, j) in enumerate(pairs, start=1 + nz):
+        slopes[:, k, i] += z[:, j]
+        slopes[:, k, j] += z[:, i]
+    return basis, slopes
+
+
+def coupling_columns(layout: Layout, velocity: Float[Array, "B n"]) -> Float[Array, "B n C"]:
+    """What each K_ij contributes to the equations: (K − Kᵀ) q̇."""
+    columns = np.zeros((*velocity.shape, len(layout.couplings)))
+    for k, (i, j) in enumerate(layout.couplings):
+        columns[:, i, k] = velocity[:, j]
+        columns[:, j, k] = -velocity[:, i]
+    return columns
+
+
+def _outputs(
+    weights: dict[str, Array], basis: Float[Array, "B H"], slopes: Float[Array, "B H nz"]
+) -> tuple[Float[Array, "B O"], Float[Array, "B O nz"]]:
+    """Network outputs and their derivatives."""
+    out = weights["lagrangian.output"]
+    return basis @ out.T, np.matmul(out, slopes)
+
+
+def _dissipation_columns(weights: dict[str, Array], data: Assembly) -> list[Array]:
+    """Columns of D's viscous, friction and width weights."""
+    v, (rows, n) = data.velocity, data.velocity.shape
+    a, s = weights["dissipation.friction"], friction_width(weights)
+    tanh = np.tanh(v[:, :, None] / s)  # (B, n, k)
+    viscous = 2 * weights["dissipation.viscous"] * v
+    friction = 2 * a * s * tanh
+    width = a**2 * (tanh - v[:, :, None] / s * (1 - tanh**2)) * (s - NARROWEST)
+    # A velocity's friction acts in its own equation alone.
+    own = np.eye(n)
+    return [
+        viscous[:, :, None] * own,
+        (friction[:, :, None] * own[:, :, None]).reshape(rows, n, -1),
+        (width[:, :, None] * own[:, :, None]).reshape(rows, n, -1),
+    ]

@@ -1,0 +1,141 @@
+"""A start for the structured form by linear least squares, and where the smallest mass ε is set.
+
+With the functions of position on a low-order basis ([1, z, zz] for M, the networks' direct path for A and
+V) and viscous D the residual is linear in all unknowns: one solve gives M, coupling, potentials and
+friction at once. A row without input is homogeneous, so that noise or too poor a basis can shrink it until
+M is not positive definite; then the start is a plain diagonal M instead.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from exlinn_fmi.learn.assembly import Assembly
+from exlinn_fmi.learn.networks import coupling_columns, product_basis
+from exlinn_fmi.mechanics.learned import Layout
+
+Array = NDArray[np.float64]
+
+SAMPLES = 4000
+"""About as many samples does the solve look at."""
+CUT = 1e-10
+"""Singular values below this share of the largest are gauges."""
+SHARE = 0.1
+"""ε as a share of the smallest mass in the solution, …"""
+LEAST = 1e-2
+"""… which is not taken for smaller than this share of the mean; the same holds for friction."""
+PLAIN = 0.3
+"""Mass and friction where the solution is of no use, as a share of the forces in its equation."""
+NONE = 1e-6
+"""Masses below this share of the forces in their equation are taken for none."""
+JOIN = 0.02
+"""First weight of friction units, relative to the viscous one: small, so that they join without a jolt."""
+SPREAD = 0.1
+"""Size of what is drawn at random, relative to the mean of M and of D: units that are 0 would stay 0."""
+
+
+class Start(NamedTuple):
+    """First weights by name, ε for each coordinate, and the size of each equation's forces, shape (n,)."""
+
+    weights: dict[str, Array]
+    epsilon: tuple[float, ...]
+    forces: Float[Array, " n"]
+
+
+class _Solution(NamedTuple):
+    """Coefficients of A and V by term, K, viscous friction, M at the samples, and sizes of forces."""
+
+    functions: dict[tuple[str, int, int], Array]
+    coupling: Array
+    viscous: Array
+    mass: Float[Array, "B n n"]
+    forces: Float[Array, " n"]
+
+
+def linear_start(layout: Layout, data: Assembly, seed: int) -> Start:
+    """Weights to start from.
+
+    Args:
+        layout: of the networks.
+        data: coefficients of the inverse model, with weights 1.
+        seed: of all that is drawn.
+    """
+    part = data.part(slice(None, None, -(-len(data) // SAMPLES)))
+    # An equation without input has a size of its own, which only the solution shows: weight by it and solve
+    # again.
+    first = _solve(layout, part, part.weight)
+    found = _solve(layout, part, 1 / first.forces)
+    random = np.random.default_rng(seed)
+    weights = {name: np.zeros(shape) for name, shape in layout.shapes.items()}
+    epsilon = np.zeros(len(found.forces))
+    output = weights["lagrangian.output"]
+    for block, columns in zip(layout.blocks, layout.columns, strict=True):
+        mean, epsilon[block] = _block_start(found.mass[:, block][:, :, block], found.forces[block])
+        factor = np.zeros((len(block), columns, layout.basis - layout.hidden))
+        drawn = random.standard_normal(factor[:, len(block) :].shape)
+        factor[:, len(block) :] = SPREAD * np.sqrt(np.diag(mean))[:, None, None] * drawn
+        factor[:, : len(block), 0] = np.linalg.cholesky(mean - np.diag(epsilon[block]))
+        for k, i in enumerate(block):
+            output[layout.rows[i], : factor.shape[2]] = factor[k]
+    for row, term in enumerate(layout.outputs):
+        if term in found.functions:
+            output[row, 1 : 1 + len(found.functions[term])] = found.functions[term]
+    weights["lagrangian.coupling"][:] = found.coupling
+    viscous = np.where(found.viscous > LEAST * found.forces, found.viscous, PLAIN * LEAST * found.forces)
+    weights["dissipation.viscous"][:] = np.sqrt(viscous)
+    weights["dissipation.friction"][:] = JOIN * np.sqrt(viscous)[:, None]
+    weights["dissipation.width"][:] = np.log(np.geomspace(0.1, 1.0, layout.friction))
+    # Each unit's transition lies somewhere in the range of its inputs, which is [-1, 1].
+    slope = weights["lagrangian.hidden.weight"]
+    slope[:] = 1.5 * random.standard_normal(slope.shape)
+    weights["lagrangian.hidden.bias"][:] = -(slope * random.uniform(-1, 1, slope.shape)).sum(axis=1)
+    return Start(weights, tuple(epsilon.tolist()), found.forces)
+
+
+def _solve(layout: Layout, part: Assembly, weight: Float[Array, " n"]) -> _Solution:
+    """Weighted linear least squares for everything at once."""
+    n = part.velocity.shape[1]
+    pairs = list(combinations_with_replacement(range(part.z.shape[1]), 2))
+    bases, columns = [], []
+    for t, (kind, _, _) in enumerate(layout.terms):
+        basis, slopes = product_basis(part.z, pairs if kind == "M" else layout.products)
+        if kind != "M":  # constants have no effect there
+            basis, slopes = basis[:, 1:], slopes[:, 1:]
+        column = part.value[:, :, t, None] * basis[:, None]
+        columns.append(column + np.einsum("bnz,bhz->bnh", part.gradient[:, :, t], slopes))
+        bases.append(basis)
+    columns += [coupling_columns(layout, part.velocity), part.velocity[:, :, None] * np.eye(n)]
+    matrix = (np.concatenate(columns, axis=2) * weight[:, None]).reshape(part.target.size, -1)
+    size = np.linalg.norm(matrix, axis=0)
+    size[size == 0] = 1
+    solution = np.linalg.lstsq(matrix / size, (part.target * weight).ravel(), rcond=CUT)[0] / size
+    parts = np.split(solution, np.cumsum([c.shape[2] for c in columns])[:-1])
+    mass = np.zeros((len(part), n, n))
+    for (kind, i, j), basis, coefficients in zip(layout.terms, bases, parts, strict=False):
+        if kind == "M":
+            mass[:, i, j] = mass[:, j, i] = basis @ coefficients
+    shares = [part.target, *(c @ x for c, x in zip(columns, parts, strict=True))]
+    forces = np.max([np.sqrt(np.mean(share**2, axis=0)) for share in shares], axis=0)
+    forces = np.maximum(forces, np.finfo(float).eps * forces.max())
+    functions = {term: x for term, x in zip(layout.terms, parts, strict=False) if term[0] != "M"}
+    return _Solution(functions, parts[-2], parts[-1], mass, forces)
+
+
+def _block_start(
+    mass: Float[Array, "B m m"], forces: Float[Array, " m"]
+) -> tuple[Float[Array, "m m"], Float[Array, " m"]]:
+    """Mean of a block of M, or a plain diagonal where that is no mass matrix, and ε."""
+    mean = mass.mean(axis=0)
+    diagonal = np.diag(mean)
+    if (diagonal > NONE * forces).all():
+        unit = np.sqrt(np.outer(diagonal, diagonal))
+        smallest = float(np.linalg.eigvalsh(mean / unit).min())
+        if smallest > LEAST:
+            least = max(float(np.linalg.eigvalsh(mass / unit).min()), LEAST * smallest)
+            return mean, SHARE * least * diagonal
+    return np.diag(PLAIN * forces), SHARE * LEAST * PLAIN * forces
