@@ -14,7 +14,7 @@ from exlinn_fmi.scenario.schema import Bounds, Nmpc, NmpcComponent, Scenario
 if TYPE_CHECKING:
     import pandas as pd
 
-DIAGNOSTICS = ("reference", "cost", "solve_status", "iterations", "kkt", "solve_time", "fallbacks")
+DIAGNOSTICS = ("reference", "cost", "solve_status", "iterations", "kkt", "solve_time", "fallbacks", "slack")
 """Outputs of a controller that are not inputs of the plant."""
 BOUND_TOLERANCE = 1e-6
 """Share of the range between two bounds by which a value may be outside: the solver's tolerance."""
