@@ -239,7 +239,9 @@ def load_python_component(reference: str, name: str, options: Mapping[str, Any],
     except TypeError as error:
         taken = list(signature.parameters.values())[1:]
         takes = f"it takes: {', '.join(map(_option, taken))}" if taken else "it takes none"
-        raise InputError(f"python: {reference}: options do not fit ({error}); {takes}") from error
+        unknown = [repr(o) for o in options if o not in [p.name for p in taken]]
+        why = f"unknown: {', '.join(unknown)}" if unknown else str(error)
+        raise InputError(f"python: {reference}: options do not fit ({why}); {takes}") from error
     try:
         component: Component = component_class(name, **options)
     except InputError:

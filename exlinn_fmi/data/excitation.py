@@ -231,7 +231,7 @@ def _numbers(path: Path, column: str, entries: object) -> NDArray[np.float64]:
     if bad.size:
         row = int(bad[0])
         found = pd.Series(entries).iloc[row]
-        shown = "nothing or nan" if pd.isna(found) else repr(found)
+        shown = "nothing or nan" if pd.isna(found) else repr(found) if isinstance(found, str) else found
         raise DataError(
             f"{path}: row {row + 1} (counted below the column names), column {column!r}: found {shown}, "
             "expected a finite number"

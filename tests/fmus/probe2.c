@@ -2,7 +2,8 @@
 
    dx/dt = u, y = gain u + x + trim, and one feed-through of each other type. A call that the state machine of
    FMI 2.0 does not allow in the present phase is an error. Calls are traced to the file PROBE_TRACE. From
-   t = 0.5 s on, doStep returns FAULT (a fmi2Status) if that is defined, or y is NaN with FAULT_NAN. */
+   t = 0.5 s on, doStep returns FAULT (a fmi2Status) if that is defined, or y is NaN with FAULT_NAN; SET_STATUS
+   and GET_STATUS are returned by every set of reals and get. */
 
 #include <math.h>
 #include <stdio.h>
@@ -12,6 +13,12 @@
 
 #ifndef FAULT
 #define FAULT fmi2OK
+#endif
+#ifndef SET_STATUS
+#define SET_STATUS fmi2OK
+#endif
+#ifndef GET_STATUS
+#define GET_STATUS fmi2OK
 #endif
 #define EXPORT __attribute__((visibility("default")))
 
@@ -151,7 +158,7 @@ EXPORT fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], si
         if (!settable(p, vr[k] != Y, vr[k] == U || vr[k] == TRIM)) return fail(p, "SetReal");
         p->s.real[vr[k]] = values[k];
     }
-    return fmi2OK;
+    return SET_STATUS;
 }
 
 EXPORT fmi2Status fmi2SetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer values[]) {
@@ -179,7 +186,7 @@ EXPORT fmi2Status fmi2SetBoolean(fmi2Component c, const fmi2ValueReference vr[],
         if (p->phase == INSTANTIATED) return fail(p, "Get" #Name);                                           \
         outputs(p);                                                                                          \
         for (size_t k = 0; k < n; k++) values[k] = p->s.member[vr[k]];                                       \
-        return fmi2OK;                                                                                       \
+        return GET_STATUS;                                                                                   \
     }
 GET(Real, fmi2Real, real)
 GET(Integer, fmi2Integer, integer)

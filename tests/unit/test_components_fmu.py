@@ -341,12 +341,33 @@ def test_an_fmi3_step_that_ends_or_returns_early_is_discarded(
     assert "t = 0.5 s" in driver.component.message
 
 
-def test_an_error_in_get_and_initialization_is_reported(tmp_path: Path) -> None:
+def test_an_error_in_the_wrong_place_is_reported_in_the_fmus_words(tmp_path: Path) -> None:
     driver = faulty(tmp_path, "FAULT=fmi2Error")
     until_trouble(driver)
     component = driver.component
     assert component.exit_initialization() == Status.ERROR
     assert "ExitInitializationMode is not allowed while failed" in component.message
+
+
+@pytest.mark.parametrize(("word", "status"), [("Warning", Status.WARNING), ("Discard", Status.DISCARD)])
+def test_a_status_of_set_and_get_is_reported_and_the_values_pass(
+    tmp_path: Path, word: str, status: Status
+) -> None:
+    path = probe(tmp_path, f"SET_STATUS=fmi2{word}", f"GET_STATUS=fmi2{word}")
+    component = FmuComponent("probe", path)
+    driver = Driver(component).begin()
+    assert driver.set(u=3.0, n_in=1) == status
+    assert component.message == f"fmi2SetReal returned fmi2{word}"
+    values = np.zeros(2)
+    assert component.get(np.array([component.index("n_out"), component.index("y")]), values) == status
+    assert component.message == f"fmi2GetReal returned fmi2{word}"
+    assert values.tolist() == [2.0, 6.0]
+
+
+def test_an_fmu_that_refuses_a_start_value_is_reported(tmp_path: Path) -> None:
+    component = FmuComponent("probe", probe(tmp_path, "SET_STATUS=fmi2Error"))
+    assert component.enter_initialization(0.0, 1.0, {"gain": 1.0}) == Status.ERROR
+    assert component.message == "fmi2SetReal returned fmi2Error"
 
 
 def test_an_error_in_one_fmu_is_not_laid_at_the_door_of_another(tmp_path: Path) -> None:
