@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from exlinn_fmi.components.base import Variable
+from exlinn_fmi.components.base import Variable, VariableType
 from exlinn_fmi.mechanics.coordinates import Coordinate, state_names, state_units
 from exlinn_fmi.scenario.schema import (
     ComponentBase,
@@ -34,30 +34,52 @@ def derived_variables(spec: ComponentBase, learned: Sequence[Coordinate]) -> tup
 
 
 def model_variables(coordinates: tuple[Coordinate, ...]) -> tuple[Variable, ...]:
-    """Variables of a learned model run as a component: inputs, then state, accelerations, stored energy."""
+    """Variables of a learned model run as a component: inputs, then state, accelerations, stored energy.
+
+    Which inputs an acceleration depends on is settled by learning; until then it may be all of them.
+    """
+    inputs = tuple(c.input for c in coordinates if c.input is not None)
     states = zip(state_names(coordinates), state_units(coordinates), strict=True)
     return (
         *(Variable(c.input, "input", unit=c.input_unit or None, start=0.0) for c in coordinates if c.input),
         *(Variable(name, "output", unit=unit, start=0.0) for name, unit in states),
-        *(Variable(c.acceleration, "output", unit=c.acceleration_unit) for c in coordinates),
+        *(
+            Variable(c.acceleration, "output", unit=c.acceleration_unit, depends_on=inputs)
+            for c in coordinates
+        ),
         Variable("energy", "output", unit="J"),
     )
 
 
 def nmpc_variables(coordinates: tuple[Coordinate, ...], options: Nmpc) -> tuple[Variable, ...]:
-    """Variables of an NMPC controller: the model's state in, its inputs out, then how the solve went."""
+    """Variables of an NMPC controller: the measured state, the inputs to apply, and how they came about.
+
+    Args:
+        coordinates: those of the model.
+        options: the controller's settings.
+    """
     states = list(zip(state_names(coordinates), state_units(coordinates), strict=True))
+    names = tuple(name for name, _ in states)
+
+    def output(name: str, unit: str | None, text: str, type_: VariableType = "Real") -> Variable:
+        return Variable(name, "output", "discrete", unit, type_, description=text, depends_on=names)
+
+    quantity = reference_unit(options.reference, dict(states))
     return (
-        *(Variable(name, "input", unit=unit, start=0.0) for name, unit in states),
-        *(Variable(c.input, "output", unit=c.input_unit or None) for c in coordinates if c.input),
-        Variable("reference", "output", unit=reference_unit(options.reference, dict(states))),
-        *(Variable(f"reference_{name}", "output", unit=unit) for name, unit in states),
-        Variable("cost", "output"),
-        Variable("solve_status", "output", "discrete", type="Integer"),
-        Variable("iterations", "output", "discrete", type="Integer"),
-        Variable("kkt", "output"),
-        Variable("solve_time", "output", unit="s"),
-        Variable("fallbacks", "output", "discrete", type="Integer"),
+        *(
+            Variable(name, "input", "continuous", unit, start=0.0, description=f"measured {name}")
+            for name, unit in states
+        ),
+        *(output(c.input, c.input_unit or None, "input to apply") for c in coordinates if c.input),
+        output("reference", quantity, "what is to be followed"),
+        *(output(f"reference_{name}", unit, f"reference of {name}") for name, unit in states),
+        output("cost", "1", "cost J of the plan"),
+        output("solve_status", "1", "0 solved, 1 iteration limit, 2 failed: fallback applied", "Enumeration"),
+        output("iterations", "1", "iterations of the solver", "Integer"),
+        output("kkt", "1", "KKT residual"),
+        output("solve_time", "s", "time that reference and solve took"),
+        output("fallbacks", "1", "fallbacks so far", "Integer"),
+        output("slack", "1", "largest violation of a state bound in the plan, over the bound's range"),
     )
 
 

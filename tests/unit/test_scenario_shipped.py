@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,11 @@ from jsonschema import Draft202012Validator
 from scenario_helpers import SCENARIO
 
 from exlinn_fmi.components.base import Variable
+from exlinn_fmi.components.lagrangian import variables_of
 from exlinn_fmi.components.python import load_python_component
-from exlinn_fmi.mechanics.coordinates import Coordinate, state_names
-from exlinn_fmi.scenario.derived import derived_variables, nmpc_variables, reference_unit
+from exlinn_fmi.control.controller import NmpcController
+from exlinn_fmi.plants.dc_motor_cart import PLANT
+from exlinn_fmi.scenario.derived import derived_variables, model_variables, nmpc_variables, reference_unit
 from exlinn_fmi.scenario.document import parse
 from exlinn_fmi.scenario.load import json_schema, load_scenario, named_files
 from exlinn_fmi.scenario.schema import (
@@ -24,6 +27,7 @@ from exlinn_fmi.scenario.schema import (
     NmpcComponent,
     PythonComponentSpec,
     Reference,
+    ScotchYoke,
     Sine,
     Table,
 )
@@ -185,23 +189,24 @@ def test_every_kind_of_component_is_known_by_a_key_of_its_own():
 
 # ── what the scenario settles by itself ──────────────────────────────────────────────────────────────────
 
-MOTOR = (
-    Coordinate("alpha", "rad", topology="circle"),
-    Coordinate("Q", "C", "electrical", "cyclic", velocity="i", velocity_unit="A", input="v", input_unit="V"),
-)
 SIGNAL = Sine(signal="sine", amplitude=1.0, frequency=1.0)
 
 
-def test_a_controller_measures_the_state_and_gives_the_inputs():
-    options = Nmpc(reference=Reference(coordinate="alpha", trajectory=SIGNAL))
-    variables = nmpc_variables(MOTOR, options)
-    assert [v.name for v in variables if v.causality == "input"] == state_names(MOTOR)
-    assert [v.name for v in variables if v.causality == "output"] == [
-        "v",
-        "reference",
-        *("reference_alpha", "reference_alpha_dot", "reference_i"),
-        *("cost", "solve_status", "iterations", "kkt", "solve_time", "fallbacks"),
+def test_a_controller_has_the_variables_that_are_derived_for_it(tmp_path):
+    reference = Reference(
+        coordinate="alpha", trajectory=SIGNAL, through=ScotchYoke(map="scotch_yoke", crank=0.2)
+    )
+    options, system = Nmpc(reference=reference, horizon=2, solver="ipopt"), PLANT.system
+    controller = NmpcController("ctl", system, options, 0.01, tmp_path)
+    assert nmpc_variables(system.coordinates, options) == controller.variables
+
+
+def test_a_model_has_the_variables_that_are_derived_for_it():
+    derived, real = model_variables(PLANT.coordinates), variables_of(replace(PLANT.system, parameters=()))
+    assert [(v.name, v.causality, v.unit, v.start) for v in derived] == [
+        (v.name, v.causality, v.unit, v.start) for v in real
     ]
+    assert all(set(r.depends_on) <= set(d.depends_on) for d, r in zip(derived, real, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -216,7 +221,7 @@ def test_unit_of_the_reference(through, stated, unit):
 
 def test_what_is_not_learned_yet_is_not_derived():
     assert derived_variables(ModelComponent(model="learned"), ()) is None
-    assert derived_variables(ModelComponent(model="folder"), MOTOR) is None
+    assert derived_variables(ModelComponent(model="folder"), PLANT.coordinates) is None
 
 
 def test_named_files_are_those_that_results_depend_on(tmp_path):
