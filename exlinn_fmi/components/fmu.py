@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
-from exlinn_fmi.components.fmu_file import FmuDescription, read_description, unpack
+from exlinn_fmi.components.fmu_file import FmuDescription, check_runnable, read_description, unpack
 from exlinn_fmi.components.fmu_native import (
     Instance,
     make_instance,
@@ -29,13 +29,20 @@ from exlinn_fmi.errors import ComponentError
 _STATUS = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 
 
-def read_variables(path: Path) -> tuple[Variable, ...]:
+def read_variables(path: Path, runnable: bool = False) -> tuple[Variable, ...]:
     """The variables of an FMU, from its model description alone: nothing is unpacked or loaded.
+
+    Args:
+        path: the .fmu file.
+        runnable: also demand a binary for this platform.
 
     Raises:
         FmuError: the file is missing or damaged, or no FMI 2.0 or 3.0 FMU for Co-Simulation.
     """
-    return read_description(Path(path)).variables
+    description = read_description(Path(path))
+    if runnable:
+        check_runnable(description)
+    return description.variables
 
 
 class FmuComponent(Component):

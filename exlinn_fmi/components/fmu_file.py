@@ -28,6 +28,9 @@ DESCRIPTION = "modelDescription.xml"
 LARGEST_DESCRIPTION = 256 * 2**20
 """Bytes of XML that are read at most: a compressed file of 1 MB can unpack to gigabytes."""
 
+LARGEST_HARMLESS = 2**30
+"""Bytes that an FMU may unpack to however small it is; beyond, a hundredfold growth is an attack."""
+
 _UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 """What zipfile raises for damaged, encrypted and unknown contents."""
 
@@ -113,6 +116,16 @@ def read_description(path: Path) -> FmuDescription:
         ) from error
 
 
+def check_runnable(description: FmuDescription) -> None:
+    """Refuse an FMU without a binary for this platform; nothing is unpacked or loaded.
+
+    Raises:
+        FmuError: says which platforms it has binaries for, and what to do.
+    """
+    with _archive(description.path) as archive:
+        _check_binary(description, archive.namelist())
+
+
 def unpack(description: FmuDescription) -> Path:
     """Unpack an FMU into a new temporary folder, less sources, documentation and other platforms' binaries.
 
@@ -123,10 +136,10 @@ def unpack(description: FmuDescription) -> Path:
         FmuError: it has no binary for this platform, or is damaged.
         StorageError: it does not fit on the disk.
     """
+    check_runnable(description)
     path = description.path
     own = f"binaries/{description.platform}/"
     with _archive(path) as archive:
-        _check_binary(description, archive.namelist())
         wanted = [
             info
             for info in archive.infolist()
@@ -136,6 +149,11 @@ def unpack(description: FmuDescription) -> Path:
         folder = Path(tempfile.mkdtemp(prefix="exlinn-fmu-"))
         try:
             size, free = sum(info.file_size for info in wanted), shutil.disk_usage(folder).free
+            if size > LARGEST_HARMLESS and size > 100 * path.stat().st_size:
+                raise FmuError(
+                    f"{path}: {path.stat().st_size / 1e6:.1f} MB that unpack to {size / 1e6:.0f} MB: "
+                    "this is a zip bomb or a mistake; it is not unpacked"
+                )
             if size > free:
                 raise StorageError(
                     f"{path}: unpacked it takes {size / 1e6:.0f} MB, but {folder.parent} has only "
@@ -175,8 +193,8 @@ def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
         what = "the zip archive is damaged or cut short" if is_zip else "not a zip archive, as every FMU is"
         size = path.stat().st_size
         raise FmuError(f"{path}: {what} ({size} bytes; {error}); copy or export it again") from error
-    except PermissionError as error:
-        raise FmuError(f"{path}: cannot be read: {error.strerror}") from error
+    except OSError as error:
+        raise FmuError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def _check_names(path: Path, names: Sequence[str]) -> None:
@@ -210,7 +228,7 @@ def _read_xml(path: Path, archive: zipfile.ZipFile) -> bytes:
 def _xml_root(path: Path, data: bytes) -> ElementTree.Element:
     try:
         return ElementTree.fromstring(data)
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # also encodings that are unknown
         raise FmuError(f"{path}: {DESCRIPTION} is no well-formed XML: {error}") from error
 
 

@@ -249,6 +249,8 @@ def load_python_component(reference: str, name: str, options: Mapping[str, Any],
     except Exception as error:
         where = _describe(error, str(module.__file__))
         raise InputError(f"python: {reference}: making it failed: {where}") from error
+    if isinstance(component, PythonComponent) and "values" not in vars(component):
+        raise InputError(f"python: {reference}: its __init__ must call super().__init__(name)")
     _check_variables(name, component.variables)
     return component
 

@@ -102,6 +102,7 @@ def test_a_zipped_folder_is_told(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("<fmiModelDescription fmiVersion='2.0'", "no well-formed XML: .*line 1"),
+        ("<?xml version='1.0' encoding='UTF-9'?><a/>", "no well-formed XML: .*UTF-9"),
         ("<html/>", "begins with <html>, expected <fmiModelDescription>"),
         (description_2(version="1.0"), r"FMI version 1\.0; expected 2\.0 or 3\.0"),
         (description_2(use="ModelExchange"), "no Co-Simulation: it is for ModelExchange only"),
@@ -180,6 +181,17 @@ def test_an_archive_that_does_not_fit_is_not_unpacked(
     assert not list((tmp_path / "temporary").iterdir())
 
 
+def test_a_zip_bomb_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fmu_file, "LARGEST_HARMLESS", 2**20)
+    members = {
+        "modelDescription.xml": description_2(),
+        BINARY: library("probe2.c"),
+        "resources/x": bytes(2**24),
+    }
+    with pytest.raises(FmuError, match=r"MB that unpack to 17 MB: this is a zip bomb"):
+        FmuComponent("probe", pack(tmp_path / "Probe.fmu", members))
+
+
 def test_a_disk_that_fills_while_unpacking_is_told(
     tmp_path: Path, tiny_disk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -208,6 +220,8 @@ def test_a_missing_binary_is_told_with_those_there_are_and_what_to_do(tmp_path: 
     }
     path = pack(tmp_path / "Probe.fmu", members)
     assert read_variables(path)
+    with pytest.raises(FmuError, match="no binary"):
+        read_variables(path, runnable=True)
     with pytest.raises(FmuError) as error:
         FmuComponent("probe", path)
     assert str(error.value) == (

@@ -277,6 +277,10 @@ class Refusing(PythonComponent):
         from exlinn_fmi.errors import InputError
         raise InputError("no sensor on this machine")
 
+class Orphan(PythonComponent):
+    def __init__(self, name):
+        self.gain = 1.0
+
 class Stranger:
     pass
 """
@@ -366,6 +370,7 @@ def test_two_components_share_their_class(folder: Path) -> None:
             {"time_constant": -1},
             r"making it failed: ValueError: time_constant must be positive \(.*mine\.py:10, in __init__\)",
         ),
+        ("mine:Orphan", {}, r"mine:Orphan: its __init__ must call super\(\)\.__init__\(name\)"),
         ("mine:Refusing", {}, r"^no sensor on this machine$"),
     ],
 )
