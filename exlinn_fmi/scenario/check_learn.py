@@ -80,6 +80,9 @@ def learning(survey: Survey) -> Iterator[Finding]:
     found = [f for k, c in enumerate(learn.coordinates) for f in _coordinate(k, c, plant, survey)]
     yield from found
     if not found:
+        if all(c.input is None for c in learn.coordinates) and not _in_coordinates(survey):
+            message = "none has an `input`; without a known force or voltage the model's scale stays open"
+            yield ("learn", "coordinates"), message
         try:
             check_coordinates(tuple(c.coordinate() for c in learn.coordinates))
         except ModelError as error:
@@ -87,6 +90,11 @@ def learning(survey: Survey) -> Iterator[Finding]:
     for at, experiment in _experiments(learn):
         yield from _experiment(at, experiment, plant, survey)
     yield from _monomials(learn, survey.coordinates)
+
+
+def _in_coordinates(survey: Survey) -> bool:
+    """Whether a mistake was cut out of the coordinates, so that they may have been meant otherwise."""
+    return any(path[:2] == ("learn", "coordinates") for path in survey.sound.cut)
 
 
 def _wrong_plant(learn: Learn, survey: Survey) -> str | None:
@@ -109,8 +117,7 @@ def _wrong_plant(learn: Learn, survey: Survey) -> str | None:
 def _coordinate(k: int, spec: CoordinateSpec, plant: str | None, survey: Survey) -> Iterator[Finding]:
     """Plant variables of a coordinate that are not there, or not what they are said to be."""
     at: KeyPath = ("learn", "coordinates", k)
-    in_doubt = any(path[:3] == at for path in survey.sound.cut)
-    if spec.position is None and spec.topology != "cyclic" and not in_doubt:
+    if spec.position is None and spec.topology != "cyclic" and not _in_coordinates(survey):
         yield (
             at,
             f"missing key 'position': the plant variable that is {spec.name}; only a cyclic one has none",

@@ -22,12 +22,13 @@ from exlinn_fmi.scenario.words import KeyPath, closest, either, found, listing, 
 Finding = tuple[KeyPath, str]
 """A mistake: where, and the text of the message."""
 
-_PATTERNS = {
+PATTERNS = {
     r"^[A-Za-z_][A-Za-z0-9_]*$": "a name of letters, digits and _ that begins with no digit",
     r"^[A-Za-z_][A-Za-z0-9_]*\..+$": "a variable as component.variable",
     r"^[\w.]+:\w+$": "a class as module:Class",
     r"^[A-Za-z0-9_.-]+$": "a name of letters, digits, _, . and -",
 }
+"""What each pattern of the vocabulary asks for, in words."""
 _EXPECTED = {
     "float_type": "a number",
     "int_type": "a whole number",
@@ -140,7 +141,7 @@ def _explain(error: ErrorDetails, place: Place) -> Finding | None:
         return _no_form(place)
     if kind == "string_pattern_mismatch":
         text = str(place.path[-1]) if place.is_key else value
-        return place.path, f"expected {_PATTERNS[context['pattern']]}, found {found(text)}"
+        return place.path, f"expected {PATTERNS[context['pattern']]}, found {found(text)}"
     if kind in _BOUNDS:
         sign, key = _BOUNDS[kind]
         return place.path, f"expected {sign} {context[key]:g}, found {found(value)}"

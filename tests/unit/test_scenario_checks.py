@@ -254,6 +254,13 @@ def test_learning_fits_its_plant(tmp_path, old, new, path, message):
     assert message in found.message
 
 
+def test_a_model_needs_an_input(tmp_path):
+    text = SCENARIO.replace("  ctl.v: plant.v\n", "").replace("      safe_input: {v: 0}\n", "")
+    text = text.replace("      inputs: {v: {min: -24, max: 24}}\n", "")
+    found = problem(tmp_path, "      input: plant.v\n", "", text)
+    assert (found.path, found.message[:21]) == ("learn.coordinates", "none has an `input`; ")
+
+
 def test_two_coordinates_do_not_share_a_name(tmp_path):
     found = problem(tmp_path, "acceleration: plant.alpha_ddot", "acceleration: plant.i")
     assert "unit mismatch" in found.message

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import json
 import random
+import re
 from typing import Any
 
 import pytest
@@ -14,8 +16,8 @@ from scenario_helpers import SCENARIO, line_of, load, problem, problems
 
 from exlinn_fmi.errors import ScenarioError
 from exlinn_fmi.scenario.document import parse
-from exlinn_fmi.scenario.explain import schema_findings, sound_part
-from exlinn_fmi.scenario.load import load_scenario
+from exlinn_fmi.scenario.explain import PATTERNS, schema_findings, sound_part
+from exlinn_fmi.scenario.load import json_schema, load_scenario
 
 TWELVE = """\
 name: a dozen
@@ -263,6 +265,12 @@ def test_without_components_nothing_is_said_of_what_names_them(tmp_path):
     text = SCENARIO[: SCENARIO.index("components:")] + SCENARIO[SCENARIO.index("connections:") :]
     (found,) = problems(tmp_path, text)
     assert found.message == "missing key 'components': what takes part, by name"
+
+
+def test_every_pattern_of_the_vocabulary_has_words():
+    schema = json.dumps(json_schema())
+    patterns = {json.loads(p) for p in re.findall(r'"pattern": ("(?:[^"\\\\]|\\\\.)*")', schema)}
+    assert patterns == set(PATTERNS)
 
 
 def places(data: Any, path: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
