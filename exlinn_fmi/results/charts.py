@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle
 from typing import TYPE_CHECKING, Literal
@@ -23,14 +24,16 @@ if TYPE_CHECKING:
 
 Role = Literal["main", "model", "reference", "bound", "error", "other"]
 
-MOST_PANELS = 8
+MOST_PANELS = 12
 MOST_LINES = 6
 HUGE = 1e100
 """Beyond this a value is no measurement but a model that has diverged; drawn as a gap."""
 STILL = 1e-3
 """A line that moves by less than this share of its size is shown as one that hardly moves."""
 COINCIDE = 0.1
-"""Two lines closer than this share of their range get a strip that shows their difference."""
+"""Two lines that are mostly closer than this share of their range get a strip that shows their difference."""
+TRANSIENT = 5.0
+"""An error that grows to this multiple of what it mostly stays within is cut off in its strip."""
 COLOURS: dict[Role, str] = {
     "main": "#0072B2",
     "model": "#D55E00",
@@ -74,6 +77,7 @@ class Panel:
         unit: its unit, ``""`` where it has no dimension.
         lines: what is drawn, first to last.
         strip: a difference to be shown in a strip of its own below, in `strip_unit`.
+        strip_limits: range of the strip, None to fit the difference.
         note: a few words beside the label, e.g. bounds that are out of sight.
         limits: range of the ordinate, None to fit the lines.
         log: whether the ordinate is logarithmic.
@@ -84,6 +88,7 @@ class Panel:
     lines: tuple[Line, ...]
     strip: Line | None = None
     strip_unit: str = ""
+    strip_limits: tuple[float, float] | None = None
     note: str = ""
     limits: tuple[float, float] | None = None
     log: bool = False
@@ -140,7 +145,7 @@ def charts(run: RunFiles) -> list[Chart]:
         loops = control_loops(run.scenario)
         made += [control_chart(run.trajectories, loop, several=len(loops) > 1) for loop in loops]
         if not loops:
-            made.append(trajectory_chart(run.trajectories))
+            made.append(trajectory_chart(run.trajectories, run.scenario.connection_list()))
     return [replace(c, panels=tuple(map(_legible, c.panels))) for c in made if c is not None]
 
 
@@ -207,12 +212,18 @@ def control_chart(trajectories: Table, loop: Loop, several: bool) -> Chart | Non
     )
 
 
-def trajectory_chart(trajectories: Table) -> Chart | None:
-    """Every recorded variable, one panel for each unit; what finds no room is named."""
+def trajectory_chart(trajectories: Table, connections: Sequence[tuple[str, str]] = ()) -> Chart | None:
+    """Every recorded variable, one panel for each unit; what finds no room is named.
+
+    Args:
+        trajectories: what was recorded.
+        connections: (from, to) pairs; an input is not drawn beside the output that it equals.
+    """
     frame = trajectories.frame
+    same = {target for source, target in connections if source in frame.columns}
     groups: dict[str, list[str]] = {}
     for column in map(str, frame.columns):
-        if column != "time" and frame[column].dtype.kind in "bif":
+        if column != "time" and column not in same and frame[column].dtype.kind in "bif":
             groups.setdefault(trajectories.unit(column), []).append(column)
     blocks = [
         (unit, columns[k : k + MOST_LINES])
@@ -239,11 +250,14 @@ def _comparison(name: str, unit: str, first: Line, second: Line, bounds: Bounds 
     lines, note = _with_bounds((first, second), bounds, unit)
     span = _range(first.y)
     error = second.y - first.y if second.role == "model" else first.y - second.y
-    worst = float(np.max(np.abs(error))) if np.isfinite(error).all() and error.size else np.inf
-    if worst <= COINCIDE * span:
-        factor, error_unit = readable(worst, unit)
+    size = np.abs(error)
+    if np.isfinite(size).all() and np.percentile(size, 75) <= COINCIDE * span and size.max() <= span:
+        mostly, worst = float(np.percentile(size, 90)), float(size.max())
+        cut = worst > TRANSIENT * mostly > 0
+        factor, error_unit = readable(mostly if cut else worst, unit)
         strip = Line("", first.x, error * factor, "error")
-        return Panel(name, unit, lines, strip, error_unit, note)
+        limits = (-1.5 * mostly * factor, 1.5 * mostly * factor) if cut else None
+        return Panel(name, unit, lines, strip, error_unit, limits, note)
     limits = None
     if span > 0 and not _range(second.y) <= 20 * span:  # a diverged model must not flatten the measurement
         low, high = float(np.nanmin(first.y)), float(np.nanmax(first.y))

@@ -54,7 +54,7 @@ RESOLUTION = 160  # dots per inch
 
 # All lengths in inches. Panels are placed by hand: all axes of a column begin at the same place.
 WIDTH, LEFT, RIGHT, BETWEEN = 7.4, 0.55, 0.15, 0.6
-TOP, BOTTOM, NOTE = 0.38, 0.42, 0.11
+TITLE, COMMON, BOTTOM, NOTE = 0.22, 0.16, 0.42, 0.11
 HEADER, LEGEND_LINE, MAIN, STRIP_HEADER, STRIP = 0.3, 0.13, 1.2, 0.17, 0.32
 LONG_NAME = 26  # characters
 
@@ -104,7 +104,9 @@ def _figure(chart: Chart, title: str) -> Figure:
     note = fill(chart.note, 140)
     bottom = BOTTOM + (NOTE * (note.count("\n") + 2) if note else 0)
     heights = [_row_height(row) for row in rows]
-    height = TOP + sum(heights) + bottom
+    common = any(line.label and line.role != "other" for p in chart.panels for line in p.lines)
+    top = TITLE + (COMMON if common else 0)
+    height = top + sum(heights) + bottom
     width = (WIDTH - LEFT - RIGHT - (columns - 1) * BETWEEN) / columns
 
     figure = Figure(figsize=(WIDTH, height))
@@ -121,17 +123,17 @@ def _figure(chart: Chart, title: str) -> Figure:
         shared = shared or axes
         return axes
 
-    upper = height - TOP
+    upper = height - top
     for r, row in enumerate(rows):
-        lower, top = upper - heights[r], upper - max(_header(panel) for panel in row)
+        lower, ceiling = upper - heights[r], upper - max(_header(panel) for panel in row)
         for c, panel in enumerate(row):
             left = LEFT + c * (width + BETWEEN)
-            axes = place(left, lower + (STRIP + STRIP_HEADER if panel.strip else 0), top)
+            axes = place(left, lower + (STRIP + STRIP_HEADER if panel.strip else 0), ceiling)
             _fill(axes, panel, most)
             if panel.strip is not None:
                 axes.tick_params(labelbottom=False)
                 axes = place(left, lower, lower + STRIP)
-                _fill_strip(axes, panel.strip, panel.strip_label, most)
+                _fill_strip(axes, panel, panel.strip, most)
             lowest = r * columns + c + columns >= len(chart.panels)
             axes.tick_params(labelbottom=lowest)
             axes.set_xlabel(chart.x_label if lowest else "")
@@ -182,14 +184,19 @@ def _head(figure: Figure, title: str, height: float) -> None:
                 common.setdefault(label, handle)
     if common:
         figure.legend(
-            list(common.values()),
-            list(common),
+            [common[name] for name in sorted(common, key=_rank)],
+            sorted(common, key=_rank),
             loc="upper left",
             bbox_to_anchor=(LEFT / WIDTH, 1 - 0.22 / height),
             ncols=len(common),
             borderaxespad=0,
             borderpad=0,
         )
+
+
+def _rank(label: str) -> int:
+    """Place of a label in the common legend: bounds, which many panels begin with, come last."""
+    return int(label == "bound")
 
 
 def _fill(axes: Axes, panel: Panel, most: int) -> None:
@@ -215,10 +222,12 @@ def _fill(axes: Axes, panel: Panel, most: int) -> None:
         )
 
 
-def _fill_strip(axes: Axes, line: Line, label: str, most: int) -> None:
-    """Draw a difference in its strip."""
+def _fill_strip(axes: Axes, panel: Panel, line: Line, most: int) -> None:
+    """Draw a panel's difference in its strip."""
     _plot(axes, line, COLOURS["error"], most)
-    axes.set_title(_plain(label), loc="left", fontsize=6.5, pad=1.5)
+    if panel.strip_limits is not None:
+        axes.set_ylim(*panel.strip_limits)
+    axes.set_title(_plain(panel.strip_label), loc="left", fontsize=6.5, pad=1.5)
     axes.tick_params(axis="y", labelsize=6.5)
     axes.yaxis.set_major_locator(MaxNLocator(2, symmetric=True))
 

@@ -92,7 +92,10 @@ class _Drawing:
         self, panel: Panel, strip: Line, x: tuple[float, float], y: tuple[float, float], lowest: bool
     ) -> None:
         """Add the strip of a panel in its domain."""
-        self._axes(x, y, lowest, {"nticks": 5, "tickfont": {"size": 10}})
+        vertical: dict[str, Any] = {"nticks": 5, "tickfont": {"size": 10}}
+        if panel.strip_limits is not None:
+            vertical["range"] = list(panel.strip_limits)
+        self._axes(x, y, lowest, vertical)
         self._annotate(escape(panel.strip_label), x[0], y[1], size=10)
         self._trace(strip, COLOURS["error"])
 

@@ -118,7 +118,7 @@ def provenance(
     return {
         "exlinn": _version(DISTRIBUTION),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": list(sys.argv),
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "scenario": scenario_file.name,
         "seed": seed,
         "duration_s": float(sum(s for s in seconds if s is not None)),

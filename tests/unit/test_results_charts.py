@@ -107,7 +107,7 @@ def test_measured_and_learned_stand_together_with_their_difference() -> None:
 
 
 def test_lines_that_the_eye_can_tell_apart_have_no_strip() -> None:
-    chart = learning_chart(Table(*evaluation(error=0.5)))
+    chart = learning_chart(Table(*evaluation(error=5.0)))
     assert chart is not None
     assert all(panel.strip is None for panel in chart.panels)
 
@@ -151,6 +151,17 @@ def test_tracking_error_is_drawn_where_the_reference_is_fresh(tmp_path: Path) ->
     assert strip is not None
     assert strip.x.size == 1001
     assert np.abs(strip.y).max() == pytest.approx(14.14, rel=1e-2)  # µm
+
+
+def test_a_start_beside_the_reference_does_not_hide_the_error_after_it(tmp_path: Path) -> None:
+    frame = trajectories()
+    frame["plant.x"] += 0.1 * np.exp(-20 * frame["time"])
+    panel = panels_of(make_run(tmp_path, control=True), frame)["x"]
+    assert panel.strip_label == "error [µm]"
+    assert panel.strip is not None
+    assert panel.strip_limits is not None
+    assert 14 < panel.strip_limits[1] < 30
+    assert panel.strip.y.max() > 1e4
 
 
 def test_bounds_out_of_sight_are_said_and_near_ones_drawn(tmp_path: Path) -> None:
@@ -207,13 +218,24 @@ def test_variables_of_one_unit_share_a_panel() -> None:
     assert shown["m"] == ["plant.x", "controller.reference"]
 
 
+def test_a_connected_input_is_drawn_as_the_output_that_drives_it(tmp_path: Path) -> None:
+    frame = trajectories(stop=0.1)
+    connection = [("controller.v", "plant.v"), ("gone.y", "plant.i")]
+    for columns, hidden in ((frame, True), (frame.drop(columns="controller.v"), False)):
+        chart = trajectory_chart(Table(columns, UNITS), connection)
+        assert chart is not None
+        shown = [line.label for panel in chart.panels for line in panel.lines]
+        assert ("plant.v" not in shown) == hidden
+        assert "plant.i" in shown
+
+
 def test_what_finds_no_room_is_named() -> None:
-    frame = pd.DataFrame({"time": [0.0, 1.0]} | {f"c.v{k}": [0.0, 1.0] for k in range(60)})
+    frame = pd.DataFrame({"time": [0.0, 1.0]} | {f"c.v{k}": [0.0, 1.0] for k in range(80)})
     chart = trajectory_chart(Table(frame))
     assert chart is not None
-    assert len(chart.panels) == 8
-    assert "c.v48, c.v49" in chart.note
-    assert "c.v47" not in chart.note
+    assert len(chart.panels) == 12
+    assert "c.v72, c.v73" in chart.note
+    assert "c.v71" not in chart.note
 
 
 def test_small_numbers_are_shown_in_a_multiple_of_their_unit(tmp_path: Path) -> None:
