@@ -174,9 +174,8 @@ def write_learning(folder: Path, *, diverges: bool = False) -> pd.DataFrame:
     write_table(folder / "evaluation", frame, units)
     steps = np.arange(60)
     loss = 10.0 ** (-steps / 6)
-    pd.DataFrame({"iteration": steps, "loss_train": loss, "loss_validation": 1.4 * loss + 1e-11}).to_csv(
-        folder / "training.csv", index=False
-    )
+    history = {"iteration": steps, "stage": "full", "loss": loss, "validation_loss": 1.4 * loss + 1e-11}
+    pd.DataFrame(history).assign(seconds=0.01 * steps).to_csv(folder / "training.csv", index=False)
     true = {"j_m": 0.1, "m_c*d^2": 0.04, "k_e": 1.0, "l": 1.0, "b_m": 0.5, "r": 5.0}
     table = pd.DataFrame({"name": list(true), "true": list(true.values())})
     table.insert(1, "identified", table["true"] * (1 + 1e-5 * np.arange(6)))

@@ -179,7 +179,13 @@ def training_chart(history: pd.DataFrame) -> Chart | None:
     losses = [str(c) for c in history.columns[1:] if "loss" in str(c)]
     roles: dict[str, Role] = {c: "model" if "valid" in c else "main" for c in losses}
     lines = tuple(
-        Line(words(c), _values(history, x), _positive(_values(history, c)), roles[c]) for c in losses
+        Line(
+            "validation" if roles[c] == "model" else "training",
+            _values(history, x),
+            _positive(_values(history, c)),
+            roles[c],
+        )
+        for c in losses
     )
     if not any(np.isfinite(line.y).any() for line in lines):
         return None

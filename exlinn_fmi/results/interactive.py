@@ -155,7 +155,7 @@ class _Drawing:
             "hoverinfo": "skip" if line.role == "bound" else "all",
         }
         if _in_legend(line):
-            trace["legendgroup"] = line.role
+            trace |= {"legendgroup": line.role, "legendrank": 2000 if line.role == "bound" else 1000}
             self.named.add(line.label)
         self.data.append(trace)
 

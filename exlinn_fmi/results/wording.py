@@ -38,6 +38,9 @@ WORDING = (
     (r"control\.fallbacks", "Steps that fell back to the previous plan", ""),
     (r"control\.iterations_mean", "Solver iterations a step, mean", ""),
     (r"control\.cost_mean", "Cost J, mean", ""),
+    (r"simulate\.steps", "Communication steps", ""),
+    (r"simulate\.seconds", "Time of the co-simulation", "s"),
+    (r"simulate\.real_time_factor", "Faster than real time by a factor of", ""),
 )
 """Pattern of a metric's key, what it means, unit; groups of the pattern go into the text."""
 
