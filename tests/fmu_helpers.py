@@ -21,6 +21,10 @@ TESTS = Path(__file__).parent
 CACHE = TESTS.parent / ".pytest_cache" / "fmus"
 WHEEL = "gemseo-fmu==3.1.1"
 
+BUILT = Path(tempfile.mkdtemp(prefix="exlinn-tests-"))
+"""Binaries of this test process. Made here, as some tests change where temporary folders go."""
+atexit.register(shutil.rmtree, BUILT, ignore_errors=True)
+
 
 @functools.cache
 def other_fmus() -> dict[str, Path]:
@@ -173,9 +177,7 @@ def description_3() -> str:
 @functools.cache
 def library(source: str, *defines: str) -> bytes:
     """The compiled binary of a source in tests/fmus, with these macros defined."""
-    folder = Path(tempfile.mkdtemp())
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    target = folder / "probe.so"
+    target = BUILT / f"{len(list(BUILT.iterdir()))}.so"
     headers = Path(fmpy.__file__).parent / "c-code"
     subprocess.run(
         ["cc", "-O1", "-std=c99", "-D_GNU_SOURCE", "-shared", "-fPIC", "-fvisibility=hidden", f"-I{headers}"]
