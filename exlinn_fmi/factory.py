@@ -37,7 +37,7 @@ def inspect(spec: ComponentBase, folder: Path) -> Sequence[Variable]:
     if isinstance(spec, FmuComponent):
         from exlinn_fmi.components.fmu import read_variables
 
-        return read_variables(folder / spec.fmu)
+        return read_variables(folder / spec.fmu, runnable=True)
     component = make("component", spec, folder, folder, 1.0)
     try:
         return component.variables
