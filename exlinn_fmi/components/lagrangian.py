@@ -6,6 +6,7 @@ import numpy as np
 
 from exlinn_fmi.components.base import Variable
 from exlinn_fmi.components.python import PythonComponent
+from exlinn_fmi.errors import ModelError
 from exlinn_fmi.mechanics.coordinates import state_units
 from exlinn_fmi.mechanics.euler_lagrange import (
     MAX_INTERNAL_STEP,
@@ -18,7 +19,7 @@ from exlinn_fmi.mechanics.plant import Plant
 
 
 class LagrangianComponent(PythonComponent):
-    """An extended Lagrangian system stepped with RK4, in equal steps no longer than `max_step`.
+    """An extended Lagrangian system stepped with RK4, in equal steps that its fastest pole allows.
 
     Inputs are the system's inputs; parameters can be set until the run begins. Outputs are the state (which
     takes start values) and the accelerations, then a plant's own outputs, or a bare system's stored energy.
@@ -26,22 +27,30 @@ class LagrangianComponent(PythonComponent):
     Args:
         name: name in the scenario.
         plant: a ground-truth plant, or a system such as a learned model.
-        max_step: longest integrator step [s], the same as in exported FMUs by default.
+        max_step: longest integrator step [s]. By default that of an exported FMU, so that the two run
+            alike; but it follows the parameters of the run, where an FMU's is found at its build.
     """
 
-    def __init__(
-        self, name: str, plant: Plant | LagrangianSystem, max_step: float = MAX_INTERNAL_STEP
-    ) -> None:
+    def __init__(self, name: str, plant: Plant | LagrangianSystem, max_step: float | None = None) -> None:
         system = plant.system if isinstance(plant, Plant) else plant
         super().__init__(name, variables_of(plant))
         inputs, states = len(system.input_names), len(system.state_names)
         u, p, y = np.split(self.values, [inputs, inputs + len(system.parameters)])
         x = y[:states]  # the state lives in the first outputs: start values, save and restore see it there
         self._state, self._next, self._h = x, np.zeros(states), np.zeros(1)
-        self._max_step = max_step
+        self._start = plant.start if isinstance(plant, Plant) else {}
+        self._system, self._parameters, self._given_step = system, p, max_step
         self._rk4 = bind(system.rk4(), (x, u, p, self._h), (self._next,))
         # Writing y over x is harmless: the first outputs are the state itself.
         self._output = bind(plant.output, (x, u, p), (y,))
+
+    def initialize(self, start_time: float, stop_time: float) -> None:
+        """Find the longest step that suits the parameters of this run."""
+        try:
+            self._max_step = self._given_step or self._system.solver_step(self._start, self._parameters)
+        except ModelError:
+            # Singular at rest, as a learned model may be: it may run from elsewhere, or else say where not.
+            self._max_step = MAX_INTERNAL_STEP
 
     def outputs(self, t: float) -> None:
         """Accelerations and all else that follows from state and inputs."""

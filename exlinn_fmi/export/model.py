@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.mechanics.coordinates import state_units
-from exlinn_fmi.mechanics.euler_lagrange import MAX_INTERNAL_STEP, LagrangianSystem, evaluate
+from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.plant import Plant
 
 SOLVER_STEP = "solver_step"
@@ -56,6 +53,7 @@ class StateSpaceModel:
         derivatives: ẋ; outputs of the FMU except those named ``der(…)``.
         outputs: y, outputs beyond states and derivatives.
         equations: z → (ẋ, y), a CasADi function of one column.
+        solver_step: longest internal step of Co-Simulation [s], a parameter of the FMU.
     """
 
     identifier: str
@@ -66,6 +64,7 @@ class StateSpaceModel:
     derivatives: tuple[Quantity, ...]
     outputs: tuple[Quantity, ...]
     equations: ca.Function
+    solver_step: float
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", self.identifier):
@@ -104,30 +103,6 @@ class StateSpaceModel:
         for row, column in zip(rows, columns, strict=True):
             found[row].append(column)
         return tuple(tuple(sorted(f)) for f in found)
-
-    @cached_property
-    def solver_step(self) -> float:
-        """Longest internal step h [s]: |λ| h ≤ 0.01 for every pole λ at the start state, rounded down.
-
-        The classical Runge–Kutta method then errs by less than 1e-10 of the state per time constant. Never
-        longer than in-process components take, so that slow models run alike in both.
-
-        Raises:
-            ModelError: ẋ is not finite at the start state.
-        """
-        n = len(self.states)
-        start = np.array([q.start for q in self.known])
-        z = ca.SX.sym("z", len(start))
-        slope = self.equations(z)[:n]
-        jacobian = ca.Function("jacobian", [z], [ca.densify(ca.jacobian(slope, z)[:, :n])])
-        poles: NDArray[np.float64] = evaluate(jacobian, start).reshape(n, n)
-        if not np.all(np.isfinite(poles)):
-            raise ModelError(
-                f"{self.identifier}: the equations are not finite at the start state and default parameters; "
-                "check the parameters and the start values"
-            )
-        fastest = float(np.max(np.abs(np.linalg.eigvals(poles))))
-        return _round_down(min(MAX_INTERNAL_STEP, 0.01 / fastest if fastest > 0 else MAX_INTERNAL_STEP))
 
 
 def plant_model(plant: Plant) -> StateSpaceModel:
@@ -168,6 +143,9 @@ def _model(
     """Name the variables of a system and put its equations in one function of one column.
 
     `output` gives states, accelerations and then `outputs`.
+
+    Raises:
+        ModelError: ẋ is not finite at the start state.
     """
     kept = [c for c in system.coordinates if c.topology != "cyclic"]
     units = state_units(system.coordinates)
@@ -197,13 +175,7 @@ def _model(
     y = output(x, u, p)[n + system.n :]
     unknown = ca.densify(ca.vertcat(system.derivative(x, u, p), y))
     equations = ca.Function("equations", [z], [ca.cse(unknown)], ["z"], ["unknown"])
+    step = system.solver_step(start)
     return StateSpaceModel(
-        identifier, description, states, inputs, parameters, derivatives, outputs, equations
+        identifier, description, states, inputs, parameters, derivatives, outputs, equations, step
     )
-
-
-def _round_down(value: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above `value`."""
-    decade = math.floor(math.log10(value) + 1e-9)
-    digit = max(d for d in (1, 2, 5) if d <= value / 10.0**decade * (1 + 1e-9))
-    return float(f"{digit}e{decade}")

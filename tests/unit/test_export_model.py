@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.export.c_code import fmu_texts
-from exlinn_fmi.export.model import StateSpaceModel, _round_down, plant_model, system_model
+from exlinn_fmi.export.model import StateSpaceModel, plant_model, system_model
 from exlinn_fmi.export.model_description import model_description
 from exlinn_fmi.mechanics.coordinates import Coordinate, Parameter
-from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
+from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, _round_down, evaluate
 from exlinn_fmi.plants import plant
 
 PLANT = plant("dc_motor_cart")
