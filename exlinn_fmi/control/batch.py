@@ -9,7 +9,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 
 class Batch:
@@ -37,7 +37,7 @@ class Batch:
             buffer.set_res(i, result.data)
         self._buffer = buffer  # has to live as long as `_evaluate`
 
-    def __call__(self, *arguments: ArrayLike) -> tuple[NDArray[np.float64], ...]:
+    def __call__(self, *arguments: NDArray[np.float64] | float) -> tuple[NDArray[np.float64], ...]:
         """Evaluate.
 
         Args:

@@ -78,9 +78,8 @@ def _flat(system: LagrangianSystem, c: int) -> Inversion | str:
     motion = [ca.SX.zeros(n) for _ in range(3)]  # q, q̇, q̈
     for k in range(3):
         motion[k][c] = y[k]
-        if k >= level:
-            for j, i in enumerate(others):
-                motion[k][i] = z[k - level][j]
+        for j, i in enumerate(others):
+            motion[k][i] = z[k - level][j] if k >= level else 0
     force = system.inverse(*motion, system.parameter_values)
     equations = force[free]
     if others and ca.depends_on(equations, ca.vertcat(z[1], z[2])):
@@ -89,18 +88,16 @@ def _flat(system: LagrangianSystem, c: int) -> Inversion | str:
     if ca.sprank(jacobian) < len(others):
         return "the equations without input do not contain the other coordinates"
 
-    # d/dt r(y, z) = 0 and d²/dt² r(y, z) = 0 are linear in ż and z̈, with the same matrix ∂r/∂z.
-    rate = ca.vertcat(y[1:], 0)
-    drift = ca.jtimes(equations, y, rate)
-    z1 = -ca.solve(jacobian, drift) if others else z[1]
-    slope = drift + jacobian @ z[1]
-    curvature = ca.jtimes(slope, y, rate) + ca.jtimes(slope, z[0], z[1])
-    z2 = -ca.solve(jacobian, curvature) if others else z[2]
-    z2 = ca.substitute(z2, z[1], z1)
-    x = _state(system, motion[0], motion[1])
-    u = force[driven]
-    x, u = ca.substitute([x, u], [z[2]], [z2])
-    x, u = ca.substitute([x, u], [z[1]], [z1])
+    x, u = _state(system, motion[0], motion[1]), force[driven]
+    if others:
+        # d/dt r(y, z) = 0 and d²/dt² r(y, z) = 0 are linear in ż and z̈, with the same matrix ∂r/∂z.
+        rate = ca.vertcat(y[1:], 0)
+        drift = ca.jtimes(equations, y, rate)
+        slope = drift + jacobian @ z[1]
+        curvature = ca.jtimes(slope, y, rate) + ca.jtimes(slope, z[0], z[1])
+        z1, z2 = -ca.solve(jacobian, drift), -ca.solve(jacobian, curvature)
+        x, u = ca.substitute([x, u], [z[2]], [z2])
+        x, u = ca.substitute([x, u], [z[1]], [z1])
     kept = system.state_names
     names = [system.coordinates[i].velocity if level else system.coordinates[i].name for i in others]
     return Inversion(

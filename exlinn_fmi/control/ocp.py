@@ -8,13 +8,14 @@ Over N intervals with states x_0 … x_N and held inputs u_0 … u_{N−1}:
 The paper's (14a) sums the inputs up to k = N, one more than there are. `cost: paper` is (13) as
 written, u* = 0; `cost: tracking` takes the u* that the model needs to follow x*.
 
-**What Q weighs.** One number for `weights.states` weighs the referenced state alone: it is what the user asked
-to follow, and weight on the others' references, right as these are, slows the approach to it (with the same
-weight on angle and speed the closed loop settles in a second instead of a tenth). Weights by name are taken as
-they are, against the reference states x* that the model needs to follow the reference.
+**What Q weighs.** One number for `weights.states` weighs the referenced state alone: it is what the user
+asked to follow, and weight on the others' references, right as these are, slows the approach to it (with
+the same weight on angle and speed the closed loop settles in a second instead of a tenth). Weights by
+name are taken as they are, against the reference states x* that the model needs to follow the reference.
 
-**State bounds** are softened: a violation s of a bound costs l₁ s + l₂ s²/2, l₁ large enough that a bound that can
-be kept is kept exactly. They are moved inwards by half a percent of their range, the room for model error.
+**State bounds** are softened: a violation s of a bound costs l₁ s + l₂ s²/2, l₁ large enough that a bound
+that can be kept is kept exactly. They are moved inwards by half a percent of their range, the room for
+model error.
 """
 
 from __future__ import annotations

@@ -26,6 +26,12 @@ INFINITE = 1e6
 TOLERANCE = 1e-9
 """Residuals to which quadratic programs are solved."""
 
+LARGE = 1e4
+"""Programs whose Hessian is larger than this are scaled down to it: rounding grows with it."""
+
+ROUGH = 10.0
+"""The same for programs that are too hard to be solved that exactly."""
+
 FEASIBLE = 1e-6
 """Violation of a constraint, over the size of the solution, from which on a solution is none."""
 
@@ -110,13 +116,17 @@ class ConicQp(QpSolver):
         n: number of states.
         m: number of inputs.
         soft: indices of the softened states, shape (s,).
+        largest: programs whose Hessian is larger than this are scaled down to it; rounding errors grow with
+            it, and may not exceed the residuals that are asked for.
 
     Raises:
         RuntimeError: CasADi was built without it.
     """
 
-    def __init__(self, plugin: str, N: int, n: int, m: int, soft: Int[np.ndarray, " s"]) -> None:
-        self.plugin = plugin
+    def __init__(
+        self, plugin: str, N: int, n: int, m: int, soft: Int[np.ndarray, " s"], largest: float = LARGE
+    ) -> None:
+        self.plugin, self._largest = plugin, largest
         s = len(soft)
         self._soft = soft
         self._layout = layout = _Layout(N, n, m, soft)
@@ -129,7 +139,7 @@ class ConicQp(QpSolver):
                 "nu": [m + s] * N + [0],
                 "ng": [2 * s] * N + [0],
                 "inf": INFINITE,
-                "hpipm": {"mode": "balance", "iter_max": 100} | residuals,
+                "hpipm": {"mode": "balance", "iter_max": 60} | residuals,
             }
         else:
             options |= {"print_header": False, "print_iter": False, "print_info": False}
@@ -150,11 +160,14 @@ class ConicQp(QpSolver):
         constant = qp.c.copy()
         constant[0] += qp.A[0] @ qp.dx0
 
-        put["h"][:] = at.h.values(np.concatenate([qp.H_x.ravel(), qp.H_end.ravel(), qp.H_u.ravel(), qp.l2]))
+        scale = 1.0 / max(1.0, np.abs(qp.H_end).max() / self._largest)
+        put["h"][:] = scale * at.h.values(
+            np.concatenate([qp.H_x.ravel(), qp.H_end.ravel(), qp.H_u.ravel(), qp.l2])
+        )
         put["a"][:] = at.a.values(np.concatenate([qp.A.ravel(), qp.B.ravel(), [1.0, -1.0]]))
-        put["g"][at.x] = qp.g[1:]
-        put["g"][at.u] = qp.r
-        put["g"][at.s] = qp.l1
+        put["g"][at.x] = scale * qp.g[1:]
+        put["g"][at.u] = scale * qp.r
+        put["g"][at.s] = scale * qp.l1
         put["lbx"][at.x], put["ubx"][at.x] = -np.inf, np.inf
         put["lbx"][at.u], put["ubx"][at.u] = qp.u_low, qp.u_high
         put["lbx"][at.s], put["ubx"][at.s] = 0.0, np.inf
@@ -198,21 +211,24 @@ class FallbackQp(QpSolver):
 
     Args:
         first: asked first.
-        second: asked where the first finds no solution.
+        others: asked one after the other where there is no solution yet.
     """
 
-    def __init__(self, first: QpSolver, second: QpSolver) -> None:
-        self._solvers = (first, second)
+    def __init__(self, first: QpSolver, *others: QpSolver) -> None:
+        self._first, self._others = first, others
 
     def solve(self, qp: StageQp) -> QpSolution:
-        """The first solution that is one, else the second's answer."""
-        first, second = self._solvers
-        solution = first.solve(qp)
-        return solution if solution.solved else second.solve(qp)
+        """The first solution that is one, else the last answer."""
+        solution = self._first.solve(qp)
+        for other in self._others:
+            if solution.solved:
+                break
+            solution = other.solve(qp)
+        return solution
 
 
 def make_qp_solver(N: int, n: int, m: int, soft: Int[np.ndarray, " s"]) -> QpSolver:
-    """The best solver that this CasADi has: hpipm with qrqp behind it, or qrqp alone.
+    """The best solver that this CasADi has: hpipm, less exact hpipm, qrqp in this order, or qrqp alone.
 
     Args:
         N: number of stages.
@@ -220,8 +236,10 @@ def make_qp_solver(N: int, n: int, m: int, soft: Int[np.ndarray, " s"]) -> QpSol
         m: number of inputs.
         soft: indices of the softened states, shape (s,).
     """
-    sparse = ConicQp("qrqp", N, n, m, soft)
-    return FallbackQp(ConicQp("hpipm", N, n, m, soft), sparse) if ca.has_conic("hpipm") else sparse
+    sparse = ConicQp("qrqp", N, n, m, soft, ROUGH)
+    if not ca.has_conic("hpipm"):
+        return sparse
+    return FallbackQp(*(ConicQp("hpipm", N, n, m, soft, size) for size in (LARGE, ROUGH)), sparse)
 
 
 @dataclass(frozen=True)
@@ -261,12 +279,14 @@ class _Entries:
         """A diagonal block."""
         self._parts.append((rows, columns, np.broadcast_to(source, rows.shape)))
 
-    def pattern(self, shape: tuple[int, int]) -> _Pattern:
+    def pattern(self, height: int, width: int) -> _Pattern:
         """The matrix."""
         rows, columns, source = (np.concatenate(part) for part in zip(*self._parts, strict=True))
         order = np.lexsort((rows, columns))  # by column, then by row, as CasADi stores
         source, rows, columns = source[order], rows[order], columns[order]
-        return _Pattern(ca.Sparsity.triplet(*shape, rows.tolist(), columns.tolist()), source, rows, columns)
+        return _Pattern(
+            ca.Sparsity.triplet(height, width, rows.tolist(), columns.tolist()), source, rows, columns
+        )
 
 
 class _Layout:
@@ -274,6 +294,7 @@ class _Layout:
 
     def __init__(self, N: int, n: int, m: int, soft: NDArray[np.intp]) -> None:
         s = len(soft)
+        self._width = N * (m + s + n)
         first, row = np.arange(N)[:, None] * (m + s + n), np.arange(N)[:, None] * (n + 2 * s)
         self.u = first + np.arange(m)
         self.s = first + m + np.arange(s)
@@ -294,14 +315,14 @@ class _Layout:
             entries.block(self.u[k], self.u[k], H_u)
             entries.diagonal(self.s[k], self.s[k], l2)
             entries.block(x, x, H_x if k + 1 < len(self.x) else H_x + n * n)
-        return entries.pattern((self.x[-1, -1] + 1, self.x[-1, -1] + 1))
+        return entries.pattern(self._width, self._width)
 
     def _constraints(self, n: int, m: int, soft: NDArray[np.intp]) -> _Pattern:
         """From the numbers (A, B, 1, −1)."""
         N = len(self.x)
         A = np.arange(N * n * n).reshape(N, n, n)
         B = N * n * n + np.arange(N * n * m).reshape(N, n, m)
-        plus = np.array(N * n * (n + m))
+        plus = np.array([N * n * (n + m)])
         entries = _Entries()
         for k in range(N):
             for rows, states in ((self.gap[k], np.arange(n)), (self.above[k], soft), (self.below[k], soft)):
@@ -311,4 +332,4 @@ class _Layout:
             entries.diagonal(self.gap[k], self.x[k], plus + 1)
             entries.diagonal(self.above[k], self.s[k], plus + 1)
             entries.diagonal(self.below[k], self.s[k], plus)
-        return entries.pattern((N * (n + 2 * len(soft)), self.x[-1, -1] + 1))
+        return entries.pattern(N * (n + 2 * len(soft)), self._width)

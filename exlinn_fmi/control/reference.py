@@ -1,8 +1,9 @@
-"""What the controller follows: from a signal for one quantity to reference states and inputs over the horizon.
+"""What the controller follows: from a signal for one quantity to states and inputs over the horizon.
 
-A signal gives the trajectory of a quantity (a cart's position), the kinematics give that of a coordinate (the
-motor's angle) with its derivatives, and inverting the model gives the states x* and inputs u* that go with it.
-States are taken at the nodes of the horizon, inputs, which are held, in the middle of each interval.
+A signal gives the trajectory of a quantity (a cart's position), the kinematics give that of a coordinate
+(the motor's angle) with its derivatives, and inverting the model gives the states x* and inputs u* that
+go with it. States are taken at the nodes of the horizon, inputs, which are held, in the middle of each
+interval.
 """
 
 from __future__ import annotations

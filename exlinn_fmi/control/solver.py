@@ -97,17 +97,27 @@ class Solver(ABC):
         Args:
             x0: measured state, shape (n,).
             references: what to follow.
-            guess: plan to start from, usually the last one shifted; None: start from the reference.
+            guess: plan to start from, usually the last one shifted; None: start from the reference, and where
+                that leads nowhere from standing still.
         """
         targets = self.ocp.targets(references)
-        start = guess if guess is not None else Plan(targets.x, targets.u)
-        x, u = start.x.copy(), np.clip(start.u, self.ocp.limits.u_min, self.ocp.limits.u_max)
+        if guess is not None:
+            return self._from(x0, guess, targets, cold=False)
+        solution = self._from(x0, Plan(targets.x, targets.u), targets, cold=True)
+        if solution.status != SolveStatus.FAILED:
+            return solution
+        # A reference that cannot be reached may be where the model says nothing: try from where we are.
+        stay = Plan(np.tile(x0, (self.ocp.horizon + 1, 1)), np.zeros_like(targets.u))
+        return self._from(x0, stay, targets, cold=True)
+
+    def _from(self, x0: Float[np.ndarray, " n"], guess: Plan, targets: Targets, cold: bool) -> Solution:
+        """Solve from a plan that need be neither finite nor within bounds."""
+        x, u = guess.x.copy(), np.clip(guess.u, self.ocp.limits.u_min, self.ocp.limits.u_max)
         x[0] = x0
         if not all(np.isfinite(a).all() for a in (x, u, targets.x, targets.u, targets.P)):
-            return failed(
-                Plan(x, u), Stats(message="the measured state, the reference or the guess is not finite")
-            )
-        return self._solve(Plan(x, u), targets, cold=guess is None)
+            message = "the measured state, the reference or the guess is not finite"
+            return failed(Plan(x, u), Stats(message=message))
+        return self._solve(Plan(x, u), targets, cold)
 
     @abstractmethod
     def _solve(self, plan: Plan, targets: Targets, cold: bool) -> Solution:
@@ -156,8 +166,9 @@ class GaussNewton(Solver):
                 return failed(plan, Stats(iteration, qp=step.solver, message=message))
             stats = Stats(iteration, self._residual(plan, at, step, targets), qp=step.solver)
             if once or stats.kkt <= self.tolerance:
-                plan = Plan(plan.x + step.dx, plan.u + step.du)
-                return self._solution(plan, targets, SolveStatus.SOLVED, stats)
+                # ū + (bound − ū) is the bound up to rounding only.
+                u = np.clip(plan.u + step.du, self.ocp.limits.u_min, self.ocp.limits.u_max)
+                return self._solution(Plan(plan.x + step.dx, u), targets, SolveStatus.SOLVED, stats)
             plan, weight = self._search(plan, at, step, targets, weight)
         message = (
             f"KKT residual {stats.kkt:.2g} after {self.iterations} iterations (tolerance {self.tolerance:g})"
@@ -193,8 +204,8 @@ class GaussNewton(Solver):
     def _residual(self, plan: Plan, at: Linearisation, step: QpSolution, targets: Targets) -> float:
         """KKT residual at a plan, with the multipliers of its quadratic program.
 
-        These make gradient + Hessian · step + constraints' part vanish, so Hessian · step is what the gradient
-        of the Lagrangian is off by; and the gaps of the dynamics.
+        These make gradient + Hessian · step + constraints' part vanish, so Hessian · step is what the
+        gradient of the Lagrangian is off by; and the gaps of the dynamics.
         """
         ocp = self.ocp
         slack = step.slack - ocp.violations(plan.x)

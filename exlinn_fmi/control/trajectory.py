@@ -1,12 +1,12 @@
-"""From a signal for some quantity to the trajectory of a coordinate: kinematics, derivatives that survive jumps.
+"""From a signal for some quantity to the trajectory of a coordinate, with derivatives that survive jumps.
 
-**Derivatives.** The signal is sampled on a grid, and nine neighbouring samples carry a polynomial of degree 8
-that is differentiated exactly. Three sets of neighbours are in question at every point: those on both sides,
-those up to it, and those from it on. The centred set serves unless another one is very much smoother (as in
-essentially non-oscillatory interpolation), so that next to a jump or a kink only samples from one side of it
-are used. Where no set is smooth (kinks all over: a coarse table), a parabola fitted to the neighbourhood gives
-velocity and acceleration, and higher derivatives are 0; where not even a parabola fits (jumps all over), all
-are 0 and the reference is a sequence of rests.
+**Derivatives.** The signal is sampled on a grid, and nine neighbouring samples carry a polynomial of
+degree 8 that is differentiated exactly. Three sets of neighbours are in question at every point: those on
+both sides, those up to it, and those from it on. The centred set serves unless another one is very much
+smoother (as in essentially non-oscillatory interpolation), so that next to a jump or a kink only samples
+from one side of it are used. Where no set is smooth (kinks all over: a coarse table), a parabola fitted
+to the neighbourhood gives velocity and acceleration, and higher derivatives are 0; where not even a
+parabola fits (jumps all over), all are 0 and the reference is a sequence of rests.
 
 Reference: A. Harten, B. Engquist, S. Osher, S. Chakravarthy, Uniformly high order accurate essentially
 non-oscillatory schemes III, J. Comput. Phys. 71 (1987).
