@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from exlinn_fmi.components.base import Component, Variable
 from exlinn_fmi.components.python import PythonComponent, load_python_component
-from exlinn_fmi.scenario.derived import derived_variables
+from exlinn_fmi.scenario.derived import derived_variables, nmpc_variables
 from exlinn_fmi.scenario.schema import (
     ComponentBase,
     FmuComponent,
@@ -38,6 +38,8 @@ def inspect(spec: ComponentBase, folder: Path) -> Sequence[Variable]:
         from exlinn_fmi.components.fmu import read_variables
 
         return read_variables(folder / spec.fmu, runnable=True)
+    if isinstance(spec, NmpcComponent):
+        return nmpc_variables(model_system(spec.nmpc.model, folder, folder).coordinates, spec.nmpc)
     component = make("component", spec, folder, folder, 1.0)
     try:
         return component.variables

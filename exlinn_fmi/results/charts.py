@@ -395,7 +395,7 @@ def readable(size: float, unit: str) -> tuple[float, str]:
     if exponent == 0:
         return 1.0, unit
     head = unit.partition("/")[0].partition(".")[0]
-    if head.isalpha() and head != "kg":
+    if head.isalpha() and head not in ("kg", "ms"):
         return 10.0**-exponent, PREFIXES[exponent] + unit
     power = "10" + str(exponent).translate(SUPERSCRIPTS)
     return 10.0**-exponent, f"{power} {unit}".strip()
