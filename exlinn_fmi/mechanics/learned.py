@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate, check_coordinates
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, Symbol
+from exlinn_fmi.mechanics.friction import log_cosh
 from exlinn_fmi.mechanics.monomials import MonomialBasis
 
 Weights = Mapping[str, NDArray[np.float64]]
@@ -83,7 +84,6 @@ class ModelSpec:
         epsilon: smallest dimensionless mass of each coordinate (structured), shape (n,).
         lagrangian_features: monomials for 𝓛 (features).
         dissipation_features: monomials for D (features).
-        feature_scales: what each monomial is divided by, 𝓛's then D's (features).
     """
 
     form: Literal["structured", "features"]
@@ -93,7 +93,6 @@ class ModelSpec:
     epsilon: tuple[float, ...] = ()
     lagrangian_features: tuple[str, ...] = ()
     dissipation_features: tuple[str, ...] = ()
-    feature_scales: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         check_coordinates(self.coordinates)
@@ -142,7 +141,6 @@ class ModelSpec:
                     "hidden.weight": (self.hidden, len(features)),
                     "hidden.bias": (self.hidden,),
                     "output.weight": (self.hidden,),
-                    "output.bias": (1,),
                 }.items()
             }
         raise ModelError(f"unknown form of model {self.form!r}; expected 'structured' or 'features'")
@@ -260,15 +258,10 @@ def learned_system(spec: ModelSpec, weights: Weights) -> LagrangianSystem:
     check_weights(spec, weights)
     if spec.form == "features":
         basis = MonomialBasis(spec.coordinates, spec.lagrangian_features, spec.dissipation_features)
-        count = len(spec.lagrangian_features)
         return LagrangianSystem.build(
             spec.coordinates,
-            lambda q, v, p: _relu_network(
-                weights, "lagrangian", basis.expressions(q, v)[0] / ca.DM(spec.feature_scales[:count])
-            ),
-            lambda v, p: _relu_network(
-                weights, "dissipation", basis.expressions(0 * v, v)[1] / ca.DM(spec.feature_scales[count:])
-            ),
+            lambda q, v, p: _relu_network(weights, "lagrangian", basis.expressions(q, v)[0]),
+            lambda v, p: _relu_network(weights, "dissipation", basis.expressions(0 * v, v)[1]),
         )
     return LagrangianSystem.build(
         spec.coordinates,
@@ -297,13 +290,11 @@ def check_weights(spec: ModelSpec, weights: Weights) -> None:
 
 def _relu_network(weights: Weights, network: str, inputs: Symbol) -> Symbol:
     """One hidden ReLU layer and one output."""
-    w = {
-        part: ca.DM(weights[f"{network}.{part}"])
-        for part in ("hidden.weight", "hidden.bias", "output.weight")
-    }
-    hidden = ca.mtimes(w["hidden.weight"], inputs) + w["hidden.bias"]
-    relu = hidden * (hidden > 0)
-    return ca.dot(w["output.weight"], relu) + float(weights[f"{network}.output.bias"][0])
+    weight, bias, output = (
+        ca.DM(weights[f"{network}.{part}"]) for part in ("hidden.weight", "hidden.bias", "output.weight")
+    )
+    hidden = ca.mtimes(weight, inputs) + bias
+    return ca.dot(output, hidden * (hidden > 0))
 
 
 def topology_features(spec: ModelSpec, q: Symbol) -> Symbol:
@@ -359,17 +350,10 @@ def _structured_dissipation(spec: ModelSpec, weights: Weights, v: Symbol) -> Sym
         w = v[i] / unit
         power += viscous[i] ** 2 / 2 * w**2
         for a, s in zip(friction[i], width[i], strict=True):
-            power += (a * s) ** 2 * _log_cosh(w / s)
+            power += (a * s) ** 2 * log_cosh(w / s)
     return spec.scales.energy / spec.scales.time * power
 
 
 def friction_width(weights: Weights) -> NDArray[np.float64]:
     """Widths s of the friction units, relative to the velocities' units, shape (n, units)."""
     return NARROWEST + np.exp(weights["dissipation.width"])
-
-
-def _log_cosh(x: Symbol) -> Symbol:
-    """Log cosh x, without overflow."""
-    # |x| with a sign that AD takes for constant, so that the second derivative at 0 is 1 and not 0.
-    size = x * (2 * (x >= 0) - 1)
-    return size + ca.log1p(ca.exp(-2 * size)) - np.log(2)

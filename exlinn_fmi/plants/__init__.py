@@ -4,9 +4,16 @@ from __future__ import annotations
 
 from exlinn_fmi.errors import InputError
 from exlinn_fmi.mechanics.plant import Plant
-from exlinn_fmi.plants import dc_motor_cart
+from exlinn_fmi.plants import (
+    dc_motor_cart,
+    magnetic_levitation,
+    mems_actuator,
+    motor_pendulum,
+    two_link_arm,
+)
 
-PLANTS: dict[str, Plant] = {page.PLANT.name: page.PLANT for page in (dc_motor_cart,)}
+PAGES = (dc_motor_cart, magnetic_levitation, mems_actuator, motor_pendulum, two_link_arm)
+PLANTS: dict[str, Plant] = {page.PLANT.name: page.PLANT for page in PAGES}
 
 
 def plant(name: str) -> Plant:
