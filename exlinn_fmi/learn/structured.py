@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.learn.assembly import Assembly, data_scales, inverse_assembly
+from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.learn.levenberg import Normal, levenberg_marquardt
 from exlinn_fmi.learn.networks import StructuredNetworks
 from exlinn_fmi.learn.start import Start, linear_start
@@ -29,15 +29,6 @@ CHUNK = 512
 """Samples whose Jacobian is made at once."""
 STAGES = {"direct": (10, 0.5), "full": (30, 0.98)}
 """A stage ends when that many iterations left more than that share of the loss."""
-
-
-class Iterate(NamedTuple):
-    """Weights after an iteration, and their dimensionless losses."""
-
-    weights: dict[str, Array]
-    loss: float
-    validation_loss: float
-    stage: str
 
 
 @dataclass(frozen=True)

@@ -187,10 +187,12 @@ Weight = Annotated[
 
 
 class Weights(Spec):
-    """Weights of the cost: a number for all, or one by name (those not named weigh 0)."""
+    """Weights of the cost: a number, or one by name (those not named weigh 0)."""
 
-    states: Weight = Field(10.0, description="Q, on x_ref − x")
-    inputs: Weight = Field(1e-3, description="R, on u, or on u − u_ref for tracking")
+    states: Weight = Field(10.0, description="Q, on x_ref − x; a number weighs the referenced state alone")
+    inputs: Weight = Field(
+        1e-3, description="R, on u, or on u − u_ref for tracking; a number weighs all inputs"
+    )
     terminal: Annotated[
         Annotated[Literal["dare"], Tag("text")] | Annotated[NonNegative, Tag("a number")], Discriminator(form)
     ] = Field("dare", description="terminal cost: the Riccati solution at the reference, or a multiple of Q")
@@ -366,7 +368,7 @@ class Structured(Spec):
     preset: Literal["structured"]
     hidden: int = Field(8, ge=1, le=512, description="units of the hidden layer of each network")
     iterations: int = Field(300, ge=1, description="most Levenberg–Marquardt iterations")
-    target: NonNegative = Field(1e-13, description="stop when the scaled training loss is below this")
+    target: NonNegative = Field(1e-20, description="stop when the scaled training loss is below this")
     regularisation: NonNegative = Field(1e-14, description="λ of the L2 term")
 
 
@@ -385,7 +387,7 @@ class Paper(Spec):
     learning_rate: Positive = Field(1e-3, description="Adam's step size")
     weight_decay: NonNegative = Field(1e-5, description="λ of the L2 term")
     epochs: int = Field(20, ge=1, description="passes over the training data")
-    batch: int = Field(1, ge=1, description="samples in a batch (the paper does not say)")
+    batch: int = Field(8, ge=1, description="samples in a batch (the paper does not say)")
 
 
 class Identify(Spec):

@@ -96,5 +96,5 @@ def test_values_of_the_true_basis_make_the_plants_lagrangian_and_dissipation() -
 
 
 def test_a_basis_may_have_no_terms_for_dissipation() -> None:
-    basis = MonomialBasis(COORDINATES, ("0.5*i^2",), ())
-    assert evaluate(basis.regressor(), np.zeros((3, 2)), np.ones((3, 2)), np.ones((3, 2))).shape == (3, 2, 1)
+    basis = MonomialBasis(COORDINATES, ("0.5*i^2", "i*alpha"), ())
+    assert evaluate(basis.regressor(), np.zeros((3, 2)), np.ones((3, 2)), np.ones((3, 2))).shape == (3, 2, 2)

@@ -1,0 +1,154 @@
+"""Training of an extended Lagrangian model on the inverse-model residual, whichever the learner."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from exlinn_fmi.data.dataset import Dataset, check_excitation, required_columns
+from exlinn_fmi.errors import TrainingError
+from exlinn_fmi.learn.iterate import Iterate
+from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
+from exlinn_fmi.mechanics.learned import ModelSpec, learned_system
+from exlinn_fmi.scenario.schema import Paper, Structured
+
+Status = Literal["converged", "iterations", "interrupted"]
+HISTORY = ["iteration", "stage", "loss", "validation_loss", "seconds"]
+"""Columns of the training history."""
+
+
+class TrainProgress(NamedTuple):
+    """How far training is.
+
+    Args:
+        iteration: iterations (or epochs) done.
+        total: the most there will be.
+        loss: mean square of the residual on the training data.
+        validation_loss: the same on the validation data.
+    """
+
+    iteration: int
+    total: int
+    loss: float
+    validation_loss: float
+
+    @property
+    def fraction(self) -> float:
+        """Share of the work that is done at most."""
+        return min(self.iteration / self.total, 1.0)
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """A learned model: what it is, its weights, and how it came about.
+
+    Args:
+        spec: everything but the weights.
+        weights: arrays by name.
+        history: one row for each iteration, columns `HISTORY`.
+        status: ``converged``: nothing more was to be gained; ``iterations``: all that were allowed are done;
+            ``interrupted``: stopped by the user. The weights are the best on the validation data in any case.
+        seconds: training time [s].
+        provenance: seed, settings, losses and hash of the data.
+    """
+
+    spec: ModelSpec
+    weights: dict[str, NDArray[np.float64]]
+    history: pd.DataFrame
+    status: Status
+    seconds: float
+    provenance: dict[str, Any]
+
+    @cached_property
+    def system(self) -> LagrangianSystem:
+        """The model's equations of motion."""
+        return learned_system(self.spec, self.weights)
+
+
+def train(
+    train: Dataset,
+    validation: Dataset,
+    method: Structured | Paper,
+    seed: int,
+    progress: Callable[[TrainProgress], None] | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> TrainedModel:
+    """Fit a model; keep the weights that are best on the validation data.
+
+    Args:
+        train: data to fit.
+        validation: data to watch.
+        method: the learner and its settings.
+        seed: of the first weights and of batches.
+        progress: told after each iteration.
+        should_stop: asked after each iteration; the best weights so far are kept then.
+
+    Raises:
+        DataError: nothing can be learned from the data.
+        TrainingError: the loss is not finite from the start.
+    """
+    check_excitation(train)
+    began = time.perf_counter()
+    spec, iterates, total = _learner(train, validation, method, seed)
+    best: Iterate | None = None
+    status: Status = "converged"
+    rows: list[tuple[int, str, float, float, float]] = []
+    for number, now in enumerate(iterates):
+        rows.append((number, now.stage, now.loss, now.validation_loss, time.perf_counter() - began))
+        if math.isfinite(now.validation_loss) and (best is None or now.rank < best.rank):
+            best = now
+        if progress is not None:
+            progress(TrainProgress(number, total, now.loss, now.validation_loss))
+        if number >= total:
+            status = "iterations"
+            break
+        if should_stop():
+            status = "interrupted"
+            break
+    if best is None:
+        raise TrainingError(
+            "the loss was not finite in any iteration; check the data's units and columns for outliers"
+        )
+    provenance = {
+        "method": method.model_dump(mode="json"),
+        "seed": seed,
+        "loss": best.loss,
+        "validation_loss": best.validation_loss,
+        "samples": len(train),
+        "data_sha256": _data_hash(train),
+    }
+    history = pd.DataFrame(rows, columns=HISTORY)
+    return TrainedModel(spec, best.weights, history, status, time.perf_counter() - began, provenance)
+
+
+def _learner(
+    train: Dataset, validation: Dataset, method: Structured | Paper, seed: int
+) -> tuple[ModelSpec, Iterator[Iterate], int]:
+    """The model, its iterates, and the most iterations."""
+    if isinstance(method, Paper):
+        from exlinn_fmi.learn.paper import (  # PyTorch is loaded here and nowhere else
+            iterate_paper,
+            paper_spec,
+        )
+
+        spec = paper_spec(train, method)
+        return spec, iterate_paper(spec, train, validation, method, seed), method.epochs
+    from exlinn_fmi.learn.structured import iterate_structured, structured_spec
+
+    spec, start = structured_spec(train, method, seed)
+    return spec, iterate_structured(spec, start, train, validation, method), method.iterations
+
+
+def _data_hash(dataset: Dataset) -> str:
+    """SHA-256 of the values that were trained on."""
+    values = dataset.frame[required_columns(dataset.coordinates)].to_numpy(dtype=float)
+    return hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest()
