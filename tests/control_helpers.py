@@ -130,15 +130,20 @@ def measure(made: NmpcController, *state: float) -> tuple[dict[str, float], Stat
 
 
 def close_loop(
-    made: NmpcController, start: NDArray[np.float64], duration: float, step: float = STEP
+    made: NmpcController,
+    start: NDArray[np.float64],
+    duration: float,
+    step: float = STEP,
+    system: LagrangianSystem | None = None,
 ) -> dict[str, NDArray[np.float64]]:
-    """Control the true motor with cart, which is stepped by RK4 at 1 ms; rows at the controller's ticks."""
-    # Substeps of 1 ms.
-    plant, p = Batch(motor_cart().rk4(round(step / 1e-3)), 1), motor_cart().parameter_values
+    """Control the true motor with cart, or another system, by RK4 at 1 ms; rows at the controller's ticks."""
+    system = system or motor_cart()
+    plant, p = Batch(system.rk4(round(step / 1e-3)), 1), system.parameter_values
     x, rows = start, []
     for k in range(round(duration / step)):
         outputs, _ = measure(made, *x)
-        rows.append(outputs | dict(zip(("alpha", "alpha_dot", "i"), x, strict=True)))
+        rows.append(outputs | dict(zip(system.state_names, x, strict=True)))
         made.step(k * step, step)
-        x = plant(x, np.array([outputs["v"]]), p, step)[0][0, :, 0].copy()
+        u = np.array([outputs[name] for name in system.input_names])
+        x = plant(x, u, p, step)[0][0, :, 0].copy()
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}

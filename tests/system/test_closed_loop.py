@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from control_helpers import CART, close_loop, controller, measure, motor_cart
+from control_helpers import CART, arm, close_loop, constant, controller, levitation, measure, motor_cart
 
 from exlinn_fmi.components.base import Status
 from exlinn_fmi.control.batch import Batch
-from exlinn_fmi.scenario.schema import Bounds, Reference, ScotchYoke, Sine, Step
+from exlinn_fmi.scenario.schema import Bounds, Reference, ScotchYoke, Sine, Step, Weights
 
 START = np.array([np.pi / 2, 0.0, 0.0])
 
@@ -114,3 +114,21 @@ def test_the_stroke_is_kept_with_its_margin():
     rows = close_loop(controller(reference=wide), START, 5.0)
     assert np.abs(0.2 * np.cos(rows["reference_alpha"])).max() == pytest.approx(0.2 * 0.95)
     assert np.all((rows["alpha"] > 0.0) & (rows["alpha"] < np.pi))
+
+
+def test_a_ball_that_falls_by_itself_is_levitated_along_a_path():
+    path = Sine(signal="sine", amplitude=0.01, frequency=1.0, offset=0.05)
+    reference = Reference(coordinate="x", trajectory=path)
+    bounds = {"u": Bounds(min=0.0, max=100.0)}
+    made = controller(levitation(), reference=reference, inputs=bounds, weights=Weights(states=1e4))
+    rows = close_loop(made, np.array([0.055, 0.0, 1.0]), 3.0, system=levitation())
+    assert np.abs(rows["x"] - rows["reference"])[200:].max() < 1e-5
+    assert np.all(rows["solve_status"] == 0)
+
+
+def test_two_inputs_move_what_has_steady_references_only():
+    bounds = {"ta": Bounds(min=-3.0, max=3.0), "tb": Bounds(min=-3.0, max=3.0)}
+    made = controller(arm(), reference=constant("a", 0.4), inputs=bounds)
+    rows = close_loop(made, np.zeros(4), 4.0, system=arm())
+    assert np.abs(rows["a"] - 0.4)[-50:].max() < 1e-3
+    assert np.all(rows["solve_status"] == 0)
