@@ -1,28 +1,23 @@
-"""What the figures show, whoever draws them: panels of lines with names and units, made from a run's tables.
-
-`figures` draws these charts with matplotlib, `interactive` with plotly. Nothing here knows a plant.
-"""
+"""What the figures show, made from a run's tables and its scenario. Nothing here knows a plant."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import cycle
-from typing import TYPE_CHECKING, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from exlinn_fmi.results.metrics import Loop, control_loops
+from exlinn_fmi.results.panels import Chart, Line, Panel, Role, extremes
 from exlinn_fmi.results.tables import LEARNED, RunFiles, Table
+from exlinn_fmi.results.typography import readable, typeset, words
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from exlinn_fmi.scenario.schema import Bounds
-
-Role = Literal["main", "model", "reference", "bound", "error", "other"]
 
 MOST_PANELS = 12
 MOST_LINES = 6
@@ -34,104 +29,6 @@ COINCIDE = 0.1
 """Two lines that are mostly closer than this share of their range get a strip that shows their difference."""
 TRANSIENT = 5.0
 """An error that grows to this multiple of what it mostly stays within is cut off in its strip."""
-COLOURS: dict[Role, str] = {
-    "main": "#0072B2",
-    "model": "#D55E00",
-    "reference": "#D55E00",
-    "bound": "#777777",
-    "error": "#009E73",
-}
-"""Okabe and Ito's palette, which people with any colour vision can tell apart."""
-OTHERS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
-SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-@dataclass(frozen=True)
-class Line:
-    """One line of a panel.
-
-    Args:
-        label: what it is, for the legend; empty where the panel's label says it.
-        x: abscissa, shape (N,).
-        y: ordinate, shape (N,); NaN makes a gap.
-        role: what it stands for, which decides how it looks; each of `other` has a colour of its own.
-        held: whether the value is held until the next one (an input, a sampled signal).
-        points: whether each value stands alone.
-    """
-
-    label: str
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    role: Role = "main"
-    held: bool = False
-    points: bool = False
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One pair of axes.
-
-    Args:
-        name: name of the quantity.
-        unit: its unit, ``""`` where it has no dimension.
-        lines: what is drawn, first to last.
-        strip: a difference to be shown in a strip of its own below, in `strip_unit`.
-        strip_limits: range of the strip, None to fit the difference.
-        note: a few words beside the label, e.g. bounds that are out of sight.
-        limits: range of the ordinate, None to fit the lines.
-        log: whether the ordinate is logarithmic.
-    """
-
-    name: str
-    unit: str
-    lines: tuple[Line, ...]
-    strip: Line | None = None
-    strip_unit: str = ""
-    strip_limits: tuple[float, float] | None = None
-    note: str = ""
-    limits: tuple[float, float] | None = None
-    log: bool = False
-
-    @property
-    def label(self) -> str:
-        """Name and unit."""
-        return axis_label(self.name, self.unit)
-
-    @property
-    def colours(self) -> list[str]:
-        """Colour of each line."""
-        own = cycle(OTHERS)
-        return [COLOURS.get(line.role) or next(own) for line in self.lines]
-
-    @property
-    def strip_label(self) -> str:
-        """Name and unit of the strip."""
-        return axis_label("error", self.strip_unit)
-
-
-@dataclass(frozen=True)
-class Chart:
-    """A figure: panels over one common abscissa.
-
-    Args:
-        name: file name without suffix.
-        title: one line.
-        panels: in reading order.
-        x_label: label of the abscissa.
-        note: what the reader should know besides.
-    """
-
-    name: str
-    title: str
-    panels: tuple[Panel, ...]
-    x_label: str = "time [s]"
-    note: str = ""
-
-    @property
-    def span(self) -> tuple[float, float]:
-        """Lowest and highest abscissa of all lines."""
-        return _extremes(np.concatenate([line.x for panel in self.panels for line in panel.lines]))
 
 
 def charts(run: RunFiles) -> list[Chart]:
@@ -198,13 +95,13 @@ def control_chart(trajectories: Table, loop: Loop, several: bool) -> Chart | Non
     rows = loop.samples(_values(frame, "time"))
     output = loop.output if loop.output not in loop.states.values() else None
     states = [
-        _tracked_panel(trajectories, path, loop.reference_of(name), loop.settings.states.get(name), rows)
+        _tracked_panel(trajectories, loop, path, loop.reference_of(name), loop.settings.states.get(name))
         for name, path in loop.states.items()
     ]
     panels = [
         _cost_panel(trajectories, loop, rows),
         *(_input_panel(trajectories, loop, name, path) for name, path in loop.inputs.items()),
-        _tracked_panel(trajectories, output, loop.own("reference"), None, rows) if output else None,
+        _tracked_panel(trajectories, loop, output, loop.own("reference")) if output else None,
         *states,
         _solve_time_panel(trajectories, loop, rows),
     ]
@@ -251,14 +148,31 @@ def trajectory_chart(trajectories: Table, connections: Sequence[tuple[str, str]]
 # ── panels ───────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _comparison(name: str, unit: str, first: Line, second: Line, bounds: Bounds | None = None) -> Panel:
-    """Two lines that should be one, on common abscissas, and their difference where no eye can see it."""
+def _comparison(
+    name: str,
+    unit: str,
+    first: Line,
+    second: Line,
+    bounds: Bounds | None = None,
+    settled: NDArray[np.bool_] | None = None,
+) -> Panel:
+    """Two lines that should be one, on common abscissas, and their difference where no eye can see it.
+
+    Args:
+        name: of the quantity.
+        unit: of the quantity.
+        first: what is judged or, for a model, what it is judged by.
+        second: the other.
+        bounds: of the quantity.
+        settled: where the difference counts, shape (N,); it is most of the time if not given.
+    """
     lines, note = _with_bounds((first, second), bounds, unit)
     span = _range(first.y)
     error = second.y - first.y if second.role == "model" else first.y - second.y
     size = np.abs(error)
     if np.isfinite(size).all() and np.percentile(size, 75) <= COINCIDE * span and size.max() <= span:
-        mostly, worst = float(np.percentile(size, 90)), float(size.max())
+        counts = settled is not None and settled.any()
+        mostly, worst = float(size[settled].max() if counts else np.percentile(size, 90)), float(size.max())
         cut = worst > TRANSIENT * mostly > 0
         factor, error_unit = readable(mostly if cut else worst, unit)
         strip = Line("", first.x, error * factor, "error")
@@ -275,14 +189,14 @@ def _comparison(name: str, unit: str, first: Line, second: Line, bounds: Bounds 
 
 
 def _tracked_panel(
-    table: Table, path: str, reference: str, bounds: Bounds | None, rows: NDArray[np.bool_]
+    table: Table, loop: Loop, path: str, reference: str, bounds: Bounds | None = None
 ) -> Panel | None:
     """A plant variable against its reference, with its bounds; compared where the reference is fresh."""
     frame = table.frame
     if path not in frame.columns:
         return None
     name, unit, time = _short(path), table.unit(path), _values(frame, "time")
-    line = Line("", time, _values(frame, path))
+    line, rows = Line("", time, _values(frame, path)), loop.samples(time)
     if reference not in frame.columns or not rows.any():
         lines, note = _with_bounds((line,), bounds, unit)
         return Panel(name, unit, lines, note=note)
@@ -293,6 +207,7 @@ def _tracked_panel(
         Line("measured", at, line.y[rows]),
         Line("reference", at, _values(frame, reference)[rows], "reference"),
         bounds,
+        at >= loop.settled,
     )
     # What happens between the samples is drawn too, the error is only known at them.
     return replace(sampled, lines=(Line("measured", time, line.y), *sampled.lines[1:]))
@@ -326,7 +241,7 @@ def _solve_time_panel(table: Table, loop: Loop, rows: NDArray[np.bool_]) -> Pane
         return None
     time, solve = _values(table.frame, "time")[rows], 1e3 * _values(table.frame, column)[rows]
     lines: tuple[Line, ...] = (Line("", time, solve, points=True),)
-    period, longest = 1e3 * loop.period, _extremes(solve)[1]
+    period, longest = 1e3 * loop.period, extremes(solve)[1]
     if longest > period / 2:
         lines += (Line("bound", time[[0, -1]], np.full(2, period), "bound"),)
     return Panel(
@@ -344,7 +259,7 @@ def _with_bounds(lines: tuple[Line, ...], bounds: Bounds | None, unit: str) -> t
     x = lines[0].x
     if bounds is None or not given or not x.size:
         return lines, ""
-    low, high = _extremes(lines[0].y)
+    low, high = extremes(lines[0].y)
     reach = 0.5 * max(high - low, 1e-9 * max(abs(low), abs(high)))
     near = [b for b in given if low - reach <= b <= high + reach]
     drawn = tuple(Line("bound", x[[0, -1]], np.full(2, b), "bound") for b in near)
@@ -359,7 +274,7 @@ def _legible(panel: Panel) -> Panel:
     """A panel in a multiple of its unit where numbers would be long, not zoomed into rounding errors."""
     if panel.log:
         return panel
-    low, high = panel.limits or _extremes(np.concatenate([line.y for line in panel.lines]))
+    low, high = panel.limits or extremes(np.concatenate([line.y for line in panel.lines]))
     size = max(abs(low), abs(high))
     if high - low < STILL * size:
         panel = replace(panel, limits=(low - STILL * size, high + STILL * size))
@@ -377,62 +292,6 @@ def _legible(panel: Panel) -> Panel:
 # ── words and numbers ────────────────────────────────────────────────────────────────────────────────────
 
 
-def axis_label(name: str, unit: str) -> str:
-    """Name and unit as an axis says them."""
-    return name if name and not unit else f"{name} [{typeset(unit) or '1'}]".strip()
-
-
-def typeset(unit: str) -> str:
-    """A unit as print has it: ``kg.m2/s2`` is kg·m²/s²."""
-    return re.sub(r"(?<=[^\W\d])-?\d+", lambda m: m[0].translate(SUPERSCRIPTS), unit).replace(".", "·")
-
-
-def readable(size: float, unit: str) -> tuple[float, str]:
-    """A factor that brings values up to `size` between 1 and 1000, and the unit they then have."""
-    if not 0 < size < np.inf:
-        return 1.0, unit
-    exponent = int(np.clip(3 * np.floor(np.log10(size) / 3), -15, 6))
-    if exponent == 0:
-        return 1.0, unit
-    head = unit.partition("/")[0].partition(".")[0]
-    if head.isalpha() and head not in ("kg", "ms"):
-        return 10.0**-exponent, PREFIXES[exponent] + unit
-    power = "10" + str(exponent).translate(SUPERSCRIPTS)
-    return 10.0**-exponent, f"{power} {unit}".strip()
-
-
-def decimate(y: NDArray[np.float64], most: int) -> NDArray[np.intp]:
-    """Indices of at most about `most` points that keep every peak and every gap of a line.
-
-    Args:
-        y: ordinates, shape (N,).
-        most: number of points wanted, at least 8.
-
-    Returns:
-        Rising indices, all of them where N ≤ `most`.
-    """
-    n = len(y)
-    if n <= most:
-        return np.arange(n)
-    width = -(-n // (most // 4))
-    rows = -(-n // width)
-    block = np.pad(y, (0, rows * width - n), mode="edge").reshape(rows, width)
-    gap = np.isnan(block)
-    kept = (
-        np.where(gap, np.inf, block).argmin(axis=1),
-        np.where(gap, -np.inf, block).argmax(axis=1),
-        gap.argmax(axis=1),  # the first point of a block where it has no gap
-    )
-    corner = width * np.arange(rows)
-    indices = np.concatenate([np.minimum(corner + k, n - 1) for k in kept] + [np.array([n - 1])])
-    return np.unique(indices)
-
-
-def shortened(name: str, most: int = 52) -> str:
-    """A name that fits in a legend, cut in the middle."""
-    return name if len(name) <= most else f"{name[: most // 2 - 1]}…{name[-most // 2 :]}"
-
-
 def _values(frame: pd.DataFrame, column: str) -> NDArray[np.float64]:
     """A column as numbers, with NaN for what is not finite or huge beyond meaning."""
     values = frame[column].to_numpy(dtype=float)
@@ -444,12 +303,6 @@ def _positive(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(values > 0, values, np.nan)
 
 
-def _extremes(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Lowest and highest of the values that are numbers, (0, 0) if none is."""
-    known = values[np.isfinite(values)]
-    return (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
-
-
 def _range(values: NDArray[np.float64]) -> float:
     """Highest less lowest value, NaN where not all are numbers."""
     return float(np.ptp(values)) if np.isfinite(values).all() and values.size else np.nan
@@ -458,11 +311,6 @@ def _range(values: NDArray[np.float64]) -> float:
 def _short(path: str) -> str:
     """A variable's name without its component."""
     return path.split(".", 1)[1]
-
-
-def words(name: str) -> str:
-    """A column's name in words."""
-    return name.replace("_", " ")
 
 
 def _join(*notes: str) -> str:

@@ -14,8 +14,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from exlinn_fmi.data.files import write_bytes
-from exlinn_fmi.results.charts import COLOURS, Chart, Line, Panel, Role, charts, decimate, shortened
+from exlinn_fmi.results.charts import charts
+from exlinn_fmi.results.panels import COLOURS, Chart, Line, Panel, Role, decimate
 from exlinn_fmi.results.tables import read_run
+from exlinn_fmi.results.typography import shortened
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

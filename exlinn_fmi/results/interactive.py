@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from exlinn_fmi.results.charts import COLOURS, Chart, Line, Panel, Role, decimate, shortened
+from exlinn_fmi.results.panels import COLOURS, Chart, Line, Panel, Role, decimate
+from exlinn_fmi.results.typography import shortened
 
 POINTS_A_LINE, POINTS_A_CHART = 5000, 60_000
 DASHES: dict[Role, str] = {"model": "dash", "reference": "dash", "bound": "dot"}

@@ -28,6 +28,7 @@ class Loop:
         controller: name of the controller component.
         start: time of its first sample [s].
         period: its sampling time [s].
+        settled: from when on errors count [s].
         settings: its part of the scenario.
         inputs: plant input by name of the controller's output that drives it.
         states: plant variable by name of the model state that it is measured for.
@@ -37,6 +38,7 @@ class Loop:
     controller: str
     start: float
     period: float
+    settled: float
     settings: Nmpc
     inputs: Mapping[str, str]
     states: Mapping[str, str]
@@ -101,6 +103,7 @@ def control_loops(scenario: Scenario) -> list[Loop]:
                 controller=name,
                 start=scenario.simulate.start,
                 period=component.step or scenario.simulate.step,
+                settled=scenario.simulate.start + scenario.metrics.settle,
                 settings=component.nmpc,
                 inputs=inputs,
                 states=states,
@@ -129,7 +132,7 @@ def control_metrics(frame: pd.DataFrame, scenario: Scenario, units: Mapping[str,
     for loop in loops:
         prefix = "control." if len(loops) == 1 else f"control.{loop.controller}."
         own = {
-            **_tracking(frame, loop, units, scenario.metrics.settle),
+            **_tracking(frame, loop, units),
             **_violations(frame, loop),
             **_effort(frame, loop),
         }
@@ -171,13 +174,13 @@ def _tracked(
     return states.get(reference.coordinate) if reference.through is None else None
 
 
-def _tracking(frame: pd.DataFrame, loop: Loop, units: Mapping[str, str], settle: float) -> dict[str, float]:
+def _tracking(frame: pd.DataFrame, loop: Loop, units: Mapping[str, str]) -> dict[str, float]:
     """Root mean square and largest distance of the output from its reference, after settling."""
     reference = loop.own("reference")
     if loop.output is None or not {loop.output, reference} <= set(frame.columns):
         return {}
     time = frame["time"].to_numpy(dtype=float)
-    rows = loop.samples(time) & (time >= loop.start + settle - 1e-6 * loop.period)
+    rows = loop.samples(time) & (time >= loop.settled - 1e-6 * loop.period)
     error = (frame[loop.output] - frame[reference]).to_numpy(dtype=float)[rows]
     if not error.size:
         return {}

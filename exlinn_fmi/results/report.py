@@ -10,10 +10,12 @@ from string import Template
 from typing import TYPE_CHECKING, Any
 
 from exlinn_fmi.data.files import write_text
-from exlinn_fmi.results.charts import Chart, charts
+from exlinn_fmi.results.charts import charts
 from exlinn_fmi.results.interactive import plotly_figure
+from exlinn_fmi.results.panels import Chart
 from exlinn_fmi.results.tables import RunFiles, read_run
-from exlinn_fmi.results.wording import GROUPS, describe, headlines, number, value
+from exlinn_fmi.results.typography import number
+from exlinn_fmi.results.wording import GROUPS, describe, headlines, value
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -112,11 +114,14 @@ def _cards(run: RunFiles) -> str:
 def _metrics(run: RunFiles) -> str:
     """All metrics by group, in plain words beside their keys."""
     html: list[tuple[str, str, str]] = []
-    groups = dict.fromkeys((*GROUPS, *(key.split(".")[0] for key in run.metrics)))
+    names: Iterable[str] = () if run.parameters is None else run.parameters["name"]
+    listed = {f"identify.{name}{suffix}" for name in names for suffix in ("", "_rel_error")}
+    keys = [key for key in run.metrics if key not in listed]  # the parameters have a table of their own
+    groups = dict.fromkeys((*GROUPS, *(key.split(".")[0] for key in keys)))
     for group in groups:
         rows = [
             (escape(describe(run, key)[0]), value(run, key), f"<code>{escape(key)}</code>")
-            for key in run.metrics
+            for key in keys
             if key.split(".")[0] == group
         ]
         if rows:

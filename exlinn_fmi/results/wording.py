@@ -1,15 +1,14 @@
-"""Metrics in plain words and readable numbers."""
+"""Metrics in plain words."""
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable
 from html import escape
 
-from exlinn_fmi.results.charts import SUPERSCRIPTS, readable, typeset, words
 from exlinn_fmi.results.metrics import control_loops, quantity
 from exlinn_fmi.results.tables import RunFiles
+from exlinn_fmi.results.typography import number, readable, typeset, words
 
 GROUPS = {
     "learn": "Learning",
@@ -21,16 +20,18 @@ GROUPS = {
 
 WORDING = (
     (r"learn\.force_mse_test", "Generalised force on the unseen test, mean square error", ""),
-    (r"learn\.force_mse_(train|validation|test)(?:_(.+))?", "Force, mean square error: {0} {1}", ""),
-    (
-        r"learn\.acceleration_n?r?mse_test(?:_(.+))?",
-        "Acceleration by the forward model on the unseen test {0}",
-        "",
-    ),
-    (r"learn\.rollout_nrmse_(\d+)s(?:_(.+))?", "Free run over {0} s, error relative to the signal {1}", ""),
-    (r"learn\.(?:train_)?seconds", "Time of training", "s"),
+    (r"learn\.force_mse_test_(.+)", "… in the equation of {0}", ""),
+    (r"learn\.force_mse_train", "Generalised force on the training data, mean square error", ""),
+    (r"learn\.acceleration_mse_test", "Acceleration on the unseen test, mean square error", ""),
+    (r"learn\.rollout_nrmse_(\d+)s", "Free run over {0} s, largest error relative to the signal", ""),
+    (r"learn\.rollout_nrmse_\d+s_(.+)", "… of {0}", ""),
+    (r"learn\.rollout_diverged", "Free runs diverged (1) or stayed finite (0)", ""),
+    (r"learn\.mass_matrix_min_eigenvalue", "Smallest eigenvalue of the mass matrix", ""),
+    (r"learn\.seconds", "Time of training", "s"),
     (r"identify\.max_rel_error", "Largest relative error of an identified parameter", ""),
-    (r"identify\.(?:rel_error_)?(.+)", "Identified {0}", ""),
+    (r"identify\.misfit", "What the identified parameters leave unexplained", ""),
+    (r"identify\.(.+)_rel_error", "Relative error of {0}", ""),
+    (r"identify\.(.+)", "Identified {0}", ""),
     (r"control\.violations", "Recorded values outside their bounds", ""),
     (r"control\.solve_ms_median", "Time of a solve, median", "ms"),
     (r"control\.solve_ms_p99", "Time of a solve, 99th percentile", "ms"),
@@ -82,7 +83,7 @@ def describe(run: RunFiles, key: str) -> tuple[str, str]:
                 return f"Input {path}, root mean square{suffix}", unit
     for pattern, text, unit in WORDING:
         if match := re.fullmatch(pattern, key):
-            filled = text.format(*(words(group or "") for group in match.groups())).strip()
+            filled = text.format(*match.groups())
             return filled + suffix, unit
     return words(key.partition(".")[2] or key).capitalize() + suffix, ""
 
@@ -101,15 +102,3 @@ def value(run: RunFiles, key: str) -> str:
     factor, multiple = readable(abs(metric), unit) if unit else (1.0, "")
     shown = f"{number(metric * factor, 3)} {typeset(multiple)}".strip()
     return f'<span title="{escape(f"{metric!r} {unit}".strip())}">{escape(shown)}</span>'
-
-
-def number(x: float, digits: int) -> str:
-    """A number with so many significant digits, powers of ten as print has them; – where there is none."""
-    if math.isnan(x):
-        return "–"
-    if not math.isfinite(x) or (x == int(x) and abs(x) < 1e6):
-        return f"{x:g}".replace("-", "−")
-    if 1e-3 <= abs(x) < 1e5:
-        return f"{x:.{digits}g}".replace("-", "−") if "e" not in f"{x:.{digits}g}" else f"{x:.0f}"
-    mantissa, _, exponent = f"{x:.{digits - 1}e}".partition("e")
-    return f"{mantissa} × 10{str(int(exponent)).translate(SUPERSCRIPTS)}".replace("-", "−")

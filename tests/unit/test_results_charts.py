@@ -12,18 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from results_helpers import UNITS, evaluation, make_run, trajectories, write_learning, write_trajectories
 
-from exlinn_fmi.results.charts import (
-    Chart,
-    Panel,
-    charts,
-    decimate,
-    learning_chart,
-    readable,
-    training_chart,
-    trajectory_chart,
-    typeset,
-)
+from exlinn_fmi.results.charts import charts, learning_chart, training_chart, trajectory_chart
+from exlinn_fmi.results.panels import Chart, Panel, decimate
 from exlinn_fmi.results.tables import Table, read_run
+from exlinn_fmi.results.typography import readable, typeset
 
 
 def panels_of(

@@ -13,8 +13,9 @@ from results_helpers import make_run, trajectories, write_learning, write_trajec
 
 from exlinn_fmi.data.files import write_table
 from exlinn_fmi.results import figures
-from exlinn_fmi.results.charts import Chart, Line, Panel, charts
+from exlinn_fmi.results.charts import charts
 from exlinn_fmi.results.figures import draw, write_figures
+from exlinn_fmi.results.panels import Chart, Line, Panel
 from exlinn_fmi.results.tables import read_run
 
 

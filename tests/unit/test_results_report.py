@@ -28,7 +28,8 @@ from exlinn_fmi.results.interactive import packed
 from exlinn_fmi.results.metrics import control_metrics
 from exlinn_fmi.results.report import write_report
 from exlinn_fmi.results.tables import read_run
-from exlinn_fmi.results.wording import describe, headlines, number
+from exlinn_fmi.results.typography import number
+from exlinn_fmi.results.wording import describe, headlines
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(1)>&$body"
 
@@ -158,6 +159,16 @@ def test_metrics_stand_in_plain_words_with_units(whole_page: Page) -> None:
 def test_parameters_stand_beside_their_true_values(whole_page: Page) -> None:
     assert "parameteridentifiedtruerelative error" in whole_page.text
     assert "m_c*d^20.04000040.041.0 × 10⁻⁵" in whole_page.text
+
+
+def test_parameters_are_not_listed_twice(tmp_path: Path) -> None:
+    folder = make_run(tmp_path, learn=True)
+    write_learning(folder)
+    more = {"identify.m_c*d^2": 0.04, "identify.m_c*d^2_rel_error": 1e-5, "identify.other_rel_error": 0.5}
+    write_json(folder / "metrics.json", read_json(folder / "metrics.json") | more)
+    text = page(folder).text
+    assert "identify.m_c*d^2" not in text
+    assert "Relative error of other0.5identify.other_rel_error" in text
 
 
 def test_stages_tell_whether_they_ran(whole_page: Page) -> None:
