@@ -4,7 +4,7 @@ x is the depth of the ball below the centre of the coil. L(x) = l_0 + l_1/(1 + (
 ball in the centre, so the field pulls it there from both sides, and a constant current balances its weight at
 two depths. At the farther one, the levitation known from laboratories, it falls or is drawn in: with the
 default parameters x = a = 20 mm, i = 2 √(a m g/l_1) = 0.6264 A and v = r i = 6.264 V (a pole at +21.5 1/s).
-Here the plant starts. At the nearer one, x = 5.92 mm with the same current, the ball hangs stably.
+Here the plant starts. At the nearer one, x = 5.91 mm with the same current, the ball hangs stably.
 """
 
 from __future__ import annotations
