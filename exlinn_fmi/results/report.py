@@ -15,7 +15,7 @@ from exlinn_fmi.results.interactive import plotly_figure
 from exlinn_fmi.results.panels import Chart
 from exlinn_fmi.results.tables import RunFiles, read_run
 from exlinn_fmi.results.typography import number
-from exlinn_fmi.results.wording import GROUPS, describe, headlines, value
+from exlinn_fmi.results.wording import GROUPS, NO_VALUE, describe, headlines, value
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -105,8 +105,9 @@ def _problems(provenance: Mapping[str, Any]) -> str:
 def _cards(run: RunFiles) -> str:
     """The few numbers that a reader wants first."""
     cards = [
-        f'<div class="card"><b>{value(run, key)}</b><span>{escape(describe(run, key)[0])}</span></div>'
+        f'<div class="card"><b>{shown}</b><span>{escape(describe(run, key)[0])}</span></div>'
         for key in headlines(run.metrics)
+        if (shown := value(run, key)) != NO_VALUE
     ]
     return f'<div class="cards">{"".join(cards)}</div>' if cards else ""
 

@@ -45,6 +45,9 @@ WORDING = (
 )
 """Pattern of a metric's key, what it means, unit; groups of the pattern go into the text."""
 
+NO_VALUE = "–"
+"""Where there was nothing to judge by."""
+
 HEADLINES = (
     r"learn\.force_mse_test",
     r"learn\.rollout_nrmse_10s",
@@ -98,7 +101,8 @@ def value(run: RunFiles, key: str) -> str:
     """A metric's value with its unit, as HTML that shows all digits when pointed at."""
     metric, unit = run.metrics[key], describe(run, key)[1]
     if metric is None:
-        return "not finite"
+        diverged = key.startswith("learn.rollout") and run.metrics.get("learn.rollout_diverged")
+        return "diverged" if diverged else NO_VALUE
     factor, multiple = readable(abs(metric), unit) if unit else (1.0, "")
     shown = f"{number(metric * factor, 3)} {typeset(multiple)}".strip()
     return f'<span title="{escape(f"{metric!r} {unit}".strip())}">{escape(shown)}</span>'

@@ -219,7 +219,7 @@ def test_a_failed_run_says_so_first(tmp_path: Path) -> None:
 def test_metrics_that_are_not_finite_say_so(tmp_path: Path) -> None:
     folder = make_run(tmp_path, learn=True)
     write_learning(folder, diverges=True)
-    assert "error relative to the signalnot finitelearn.rollout_nrmse_10s" in page(folder).text
+    assert "error relative to the signalno finite valuelearn.rollout_nrmse_10s" in page(folder).text
 
 
 def test_parameters_without_true_value_show_a_dash(tmp_path: Path) -> None:
