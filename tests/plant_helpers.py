@@ -126,7 +126,7 @@ CASES = {
         magnetic_levitation,
     ),
     "mems_actuator": Case(
-        {"x": 0.0005, "Q": 4e-8, "x_dot": 0.01},
+        {"x": 0.0005, "Q": 4e-8, "x_dot": 0.01, "i": 1e-6},
         {"F_ext": 0.0, "v": 0.0},
         {"F_ext": 0.003, "v": 1200.0},
         (4e-3, 1e-7, 0.1, 1e-5),

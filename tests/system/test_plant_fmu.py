@@ -1,44 +1,40 @@
-"""The plant FMU as an importer sees it: valid, accurate, true to the standard, as the committed one."""
+"""Every plant's FMU as an importer sees it: valid, accurate, its Python component's twin, as committed."""
 
 from __future__ import annotations
 
-import math
 import re
 import zipfile
 from collections.abc import Iterator
-from ctypes import c_double, c_int, c_void_p
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
 from export_helpers import Instance, instance
-from fmpy.fmi1 import FMICallException
 from fmpy.validation import validate_fmu
+from plant_helpers import CASES, column, parameters, start_state
 from scipy.integrate import solve_ivp
 
 from exlinn_fmi.components.lagrangian import LagrangianComponent
 from exlinn_fmi.export import export_plant
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
-from exlinn_fmi.plants import plant
+from exlinn_fmi.mechanics.plant import Plant
+from exlinn_fmi.plants import PLANTS
 
-PLANT = plant("dc_motor_cart")
-SYSTEM = PLANT.system
-STATES = SYSTEM.state_names
-DEFAULTS = SYSTEM.parameter_values
-X0 = {"alpha": 0.7, "alpha_dot": -1.5, "i": 0.4}
 MS = 1e-3
 
 
-def paper_input(steps: int, h: float = MS) -> dict[str, np.ndarray]:
-    """The paper's voltage v = 2 (0.5 sin 2t + 2), held over each step."""
-    return {"v": 2 * (0.5 * np.sin(2 * h * np.arange(steps)) + 2)}
+@pytest.fixture(scope="module", params=PLANTS.values(), ids=PLANTS)
+def page(request: pytest.FixtureRequest) -> Plant:
+    """Each plant in turn."""
+    found: Plant = request.param
+    return found
 
 
 @pytest.fixture(scope="module")
-def fmu(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def fmu(page: Plant, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A fresh build."""
-    return export_plant(PLANT, tmp_path_factory.mktemp("fmu") / "fresh.fmu")
+    return export_plant(page, tmp_path_factory.mktemp("fmu") / "fresh.fmu")
 
 
 @pytest.fixture
@@ -48,17 +44,13 @@ def cs(fmu: Path) -> Iterator[Instance]:
 
 
 @pytest.fixture
-def me(fmu: Path) -> Iterator[Instance]:
-    with instance(fmu, "me") as made:
-        yield made
+def committed(page: Plant, root: Path) -> Path:
+    return root / "fmus" / f"{page.model_name}.fmu"
 
 
-def refused(made: Instance, message: str, call: object, *arguments: object) -> None:
-    """The call ends with fmi2Error and the log says why."""
-    with pytest.raises(FMICallException) as caught:
-        call(*arguments)  # type: ignore[operator]
-    assert caught.value.status == 3
-    assert re.search(message, made.log[-1]), made.log
+def names(page: Plant) -> list[str]:
+    """Names of all outputs."""
+    return [o.name for o in page.output_list]
 
 
 # ── the file ─────────────────────────────────────────────────────────────────────────────────────────────
@@ -68,8 +60,8 @@ def test_fmpy_validates_without_a_problem(fmu: Path) -> None:
     assert validate_fmu(str(fmu)) == []
 
 
-def test_committed_fmu_has_the_texts_of_a_fresh_build(fmu: Path, root: Path) -> None:
-    with zipfile.ZipFile(root / "fmus" / "DCMotorCart.fmu") as old, zipfile.ZipFile(fmu) as new:
+def test_committed_fmu_has_the_texts_of_a_fresh_build(fmu: Path, committed: Path) -> None:
+    with zipfile.ZipFile(committed) as old, zipfile.ZipFile(fmu) as new:
         equations = old.read("sources/equations.c").decode()
         made_with = ".".join(re.findall(r"\*(?:major|minor|patch) = (\d+);", equations))
         if made_with != ca.__version__:
@@ -80,392 +72,125 @@ def test_committed_fmu_has_the_texts_of_a_fresh_build(fmu: Path, root: Path) -> 
             assert old.read(name) == new.read(name), name
 
 
-def test_committed_binary_runs_bit_for_bit_as_a_fresh_build(fmu: Path, root: Path) -> None:
-    names = [v.name for v in PLANT.output_list]
-    runs = []
-    for file in (root / "fmus" / "DCMotorCart.fmu", fmu):
+def test_committed_binary_runs_bit_for_bit_as_a_fresh_build(page: Plant, fmu: Path, committed: Path) -> None:
+    case, runs = CASES[page.name], []
+    for file in (committed, fmu):
         with instance(file) as made:
-            made.start(X0)
-            runs.append(made.run(names, MS, paper_input(2000)))
+            made.start(case.start)
+            runs.append(made.run(names(page), MS, case.inputs(2000, 50)))
     np.testing.assert_array_equal(runs[0], runs[1])
 
 
-# ── Co-Simulation ────────────────────────────────────────────────────────────────────────────────────────
-
-
-def test_ten_seconds_equal_runge_kutta_in_python(cs: Instance) -> None:
-    inputs = paper_input(10_000)
-    cs.start(X0)
-    states = cs.run(STATES, MS, inputs)
-    march = SYSTEM.rk4(1).mapaccum(10_000)
-    u = np.vstack([np.zeros(10_000), inputs["v"]])
-    expected = march(list(X0.values()), u, DEFAULTS, MS).full().T
-    np.testing.assert_allclose(states, expected, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("h", [1e-3, 1e-2])
-def test_ten_seconds_equal_dop853_under_a_constant_input(cs: Instance, h: float) -> None:
-    steps = round(10 / h)
-    cs.start(X0)
-    end = cs.run(STATES, h, {"v": np.full(steps, 5.0)})
-    exact = solve_ivp(
-        lambda _, x: evaluate(SYSTEM.derivative, x, [0.0, 5.0], DEFAULTS)[0],
-        (0, 10),
-        list(X0.values()),
-        "DOP853",
-        t_eval=np.linspace(0, 10, 101)[1:],
-        rtol=1e-13,
-        atol=1e-13,
-    )
-    np.testing.assert_allclose(end[steps // 100 - 1 :: steps // 100], exact.y.T, rtol=0, atol=1e-8)
-
-
-def test_ten_seconds_equal_the_python_component(cs: Instance) -> None:
-    inputs = paper_input(1000, 0.01)
-    cs.start({**X0, "j_m": 0.15})
-    names = [o.name for o in PLANT.output_list]
-    component = LagrangianComponent("plant", PLANT)
-    component.enter_initialization(0.0, 10.0, {**X0, "j_m": 0.15})
-    component.exit_initialization()
-    asked, v = np.array([component.index(n) for n in names]), np.array([component.index("v")])
-    rows = np.zeros((1000, len(names)))
-    for k in range(1000):
-        component.set(v, inputs["v"][k : k + 1])
-        component.step(0.01 * k, 0.01)
-        component.get(asked, rows[k])
-    np.testing.assert_allclose(cs.run(names, 0.01, inputs), rows, rtol=0, atol=1e-9)
-
-
-def equations_19(_: float, x: np.ndarray, v: float) -> list[float]:
-    """Eq. (19) of the paper written out by hand, at the default parameters."""
-    alpha, omega, i = x
-    m = 0.2**2  # m_c d²
-    sine, cosine = math.sin(alpha), math.cos(alpha)
-    torque = i - 0.5 * omega - m * sine * cosine * omega**2
-    return [omega, torque / (0.1 + m * sine**2), v - omega - 5 * i]
-
-
-def test_ten_seconds_equal_dop853_of_equations_19_under_the_papers_held_input(cs: Instance) -> None:
-    inputs = paper_input(10_000)
-    cs.start(X0)
-    states = cs.run(STATES, MS, inputs)
-    x, exact = np.array(list(X0.values())), []
-    for v in inputs["v"]:
-        tolerances = {"rtol": 1e-13, "atol": 1e-13, "first_step": MS}
-        x = solve_ivp(equations_19, (0, MS), x, "DOP853", args=(v,), **tolerances).y[:, -1]
-        exact.append(x)
-    np.testing.assert_allclose(states, exact, rtol=0, atol=1e-8)
-
-
-def test_outputs_equal_the_plants_at_the_present_state_and_input(cs: Instance) -> None:
-    cs.start(X0)
-    cs.set("v", 7.0)
-    cs.set("tau_ext", 0.3)
-    expected = evaluate(PLANT.output, list(X0.values()), [0.3, 7.0], DEFAULTS)[0]
-    np.testing.assert_allclose(cs.get(*(o.name for o in PLANT.output_list)), expected, rtol=1e-14)
-
-
-def test_power_balance_holds_along_the_outputs(cs: Instance) -> None:
-    """Stored energy gained = supplied − dissipated, the powers integrated by Simpson's rule."""
-    names = ["T", "W_m", "i", "alpha_dot", "D"]
-    cs.start(X0)
-    first = np.array(cs.get(*names))
-    rows = np.vstack([first, cs.run(names, MS, {"v": np.full(2000, 5.0), "tau_ext": np.full(2000, 0.2)})])
-    kinetic, magnetic, i, alpha_dot, D = rows.T
-    power = 5.0 * i + 0.2 * alpha_dot - 2 * D
-    energy = MS / 3 * (power[0] + 4 * power[1::2].sum() + 2 * power[2:-1:2].sum() + power[-1])
-    assert kinetic[-1] + magnetic[-1] - first[0] - first[1] == pytest.approx(energy, abs=1e-9)
-
-
-def test_parameters_set_before_the_start_act(cs: Instance) -> None:
-    cs.start({**X0, "r": 8.0, "m_c": 2.0})
-    states = cs.run(STATES, MS, paper_input(1000))
-    p = DEFAULTS.copy()
-    p[[q.name for q in SYSTEM.parameters].index("r")] = 8.0
-    p[[q.name for q in SYSTEM.parameters].index("m_c")] = 2.0
-    u = np.vstack([np.zeros(1000), paper_input(1000)["v"]])
-    expected = SYSTEM.rk4(1).mapaccum(1000)(list(X0.values()), u, p, MS).full().T
-    np.testing.assert_allclose(states, expected, rtol=0, atol=1e-11)
-
-
-def test_parameters_can_be_tuned_between_steps(cs: Instance) -> None:
-    cs.start(X0)
-    cs.run(STATES, MS, paper_input(1))
-    cs.set("k_e", 0.5)
-    i, tau_e = cs.get("i", "tau_e")
-    assert tau_e == 0.5 * i
-
-
-def test_solver_step_divides_the_communication_step(cs: Instance) -> None:
-    cs.start({**X0, "solver_step": 0.004})
-    states = cs.run(STATES, 0.01, {"v": np.array([5.0])})
-    expected = SYSTEM.rk4(3)(list(X0.values()), [0.0, 5.0], DEFAULTS, 0.01).full().T
-    np.testing.assert_allclose(states, expected, rtol=0, atol=1e-14)
-
-
-def test_reset_brings_the_start_values_back(cs: Instance) -> None:
-    cs.start({**X0, "r": 8.0})
-    cs.run(STATES, MS, paper_input(10))
-    cs.fmu.reset()
+def test_its_solver_step_is_the_plants(page: Plant, cs: Instance) -> None:
     cs.start()
-    assert cs.get("r", *STATES) == [5.0, 0.0, 0.0, 0.0]
-    np.testing.assert_array_equal(cs.run(STATES, MS, paper_input(1)).shape, (1, 3))
+    assert cs.get("solver_step") == [page.system.solver_step(page.start)]
 
 
-def test_two_instances_do_not_disturb_each_other(fmu: Path, cs: Instance) -> None:
-    cs.start(X0)
-    with instance(fmu, name="other") as other:
-        other.start({"alpha": 2.0, "l": 0.5})
-        mixed = []
-        for k in range(100):
-            mixed.append(cs.run(STATES, MS, {"v": np.array([5.0])}, first=k)[0])
-            other.run(STATES, MS, {"v": np.array([-9.0])}, first=k)
-    with instance(fmu) as alone:
-        alone.start(X0)
-        np.testing.assert_array_equal(alone.run(STATES, MS, {"v": np.full(100, 5.0)}), mixed)
+# ── trajectories ─────────────────────────────────────────────────────────────────────────────────────────
 
 
-# ── FMU state ────────────────────────────────────────────────────────────────────────────────────────────
+@pytest.mark.parametrize(("steps", "h"), [(4000, MS), (100, 10 * MS)])
+def test_seconds_equal_the_python_component_bit_for_bit(
+    page: Plant, cs: Instance, steps: int, h: float
+) -> None:
+    case = CASES[page.name]
+    inputs = case.inputs(steps, steps // 40)
+    cs.start(case.start)
+    component = LagrangianComponent("plant", page)
+    component.enter_initialization(0.0, steps * h, case.start)
+    component.exit_initialization()
+    asked = np.array([component.index(name) for name in names(page)])
+    driven = np.array([component.index(name) for name in inputs])
+    columns, rows = np.column_stack(list(inputs.values())), np.zeros((steps, len(asked)))
+    for k in range(steps):
+        component.set(driven, columns[k])
+        component.step(h * k, h)
+        component.get(asked, rows[k])
+    np.testing.assert_array_equal(cs.run(names(page), h, inputs), rows)
 
 
-def test_restored_state_continues_bit_for_bit(cs: Instance) -> None:
-    names = [v.name for v in PLANT.output_list]
-    cs.start({**X0, "b_m": 0.7})
-    cs.run(STATES, MS, paper_input(50))
-    saved = cs.fmu.getFMUState()
-    onward = cs.run(names, MS, paper_input(100), first=50)
-    cs.set("b_m", 0.1)
-    cs.fmu.setFMUState(saved)
-    np.testing.assert_array_equal(cs.run(names, MS, paper_input(100), first=50), onward)
-    cs.fmu.freeFMUState(saved)
+def test_ten_seconds_equal_dop853_of_the_equations_written_out_by_hand(page: Plant, cs: Instance) -> None:
+    """Inputs jump every 0.1 s; errors count in shares of each state's largest value, to 1e-8."""
+    case, p, hold = CASES[page.name], parameters(page), 100
+    inputs = case.inputs(10_000, hold)
+    cs.start(case.start)
+    states = cs.run(page.system.state_names, MS, inputs)
+    x, size, exact = start_state(page.name), np.abs(states).max(0), []
+    for u in np.column_stack(list(inputs.values()))[::hold]:
+        run = solve_ivp(
+            lambda _, z, u=u: np.array(case.equations(z * size, u, p)) / size,
+            (0, hold * MS),
+            x / size,
+            "DOP853",
+            rtol=1e-13,
+            atol=1e-13,
+        )
+        x = run.y[:, -1] * size
+        exact.append(x)
+    np.testing.assert_allclose(states[hold - 1 :: hold] / size, np.array(exact) / size, rtol=0, atol=1e-8)
 
 
-def test_serialised_state_continues_bit_for_bit_in_another_instance(fmu: Path, cs: Instance) -> None:
-    names = [v.name for v in PLANT.output_list]
-    cs.start({**X0, "b_m": 0.7})
-    cs.run(STATES, MS, paper_input(50))
-    saved = cs.fmu.getFMUState()
-    data = cs.fmu.serializeFMUState(saved)
-    cs.fmu.freeFMUState(saved)
-    onward = cs.run(names, MS, paper_input(100), first=50)
-    with instance(fmu, name="other") as other:
-        restored = other.fmu.deSerializeFMUstate(data)
-        other.fmu.setFMUState(restored)
-        np.testing.assert_array_equal(other.run(names, MS, paper_input(100), first=50), onward)
-        other.fmu.freeFMUState(restored)
+def test_power_balance_holds_along_the_run(page: Plant, cs: Instance) -> None:
+    """Stored energy gained = supplied − dissipated, the powers integrated by Simpson's rule."""
+    case, system, p = CASES[page.name], page.system, column(page)
+    inputs, h = case.inputs(1000, 1000), 5 * system.solver_step(page.start)
+    u = np.array([values[0] for values in inputs.values()])
+    cs.start(case.start)
+    x = np.vstack([start_state(page.name), cs.run(system.state_names, h, inputs)])
+    power = np.array([[float(w) for w in system.power(row[-system.n :], u, p)] for row in x])
+    net = power[:, 0] - power[:, 1]
+    work = h / 3 * (net[0] + 4 * net[1::2].sum() + 2 * net[2:-1:2].sum() + net[-1])
+    first, last = (float(system.energy(*system.split_state(ca.DM(row)), p)) for row in (x[0], x[-1]))
+    passed = h * np.abs(power).sum()
+    assert last - first == pytest.approx(work, abs=1e-7 * passed)
 
 
-def test_foreign_bytes_are_no_state(cs: Instance) -> None:
-    refused(cs, "not a state of this build of DCMotorCart", cs.fmu.deSerializeFMUstate, b"x" * 1000)
+def test_outputs_equal_the_plants_at_the_present_state_and_input(page: Plant, cs: Instance) -> None:
+    case = CASES[page.name]
+    cs.start(case.start)
+    inputs = {name: case.mean[name] + case.spread[name] for name in case.mean}
+    for name, value in inputs.items():
+        cs.set(name, value)
+    expected = evaluate(page.output, start_state(page.name), list(inputs.values()), column(page))[0]
+    np.testing.assert_allclose(cs.get(*names(page)), expected, rtol=1e-13)
 
 
-# ── directional derivatives ──────────────────────────────────────────────────────────────────────────────
+# ── derivatives ──────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_directional_derivatives_equal_finite_differences(cs: Instance) -> None:
-    unknown = ["alpha", "der(alpha)", *(o.name for o in PLANT.output_list[len(STATES) :])]
-    known = [*STATES, "tau_ext", "v", *(p.name for p in SYSTEM.parameters)]
-    values = [*X0.values(), 0.3, 7.0, *DEFAULTS]
-    direction = np.random.default_rng(1).normal(size=len(known))
+def test_directional_derivatives_equal_finite_differences(page: Plant, cs: Instance) -> None:
+    case, system = CASES[page.name], page.system
+    unknown = [o.name for o in page.output_list[len(system.state_names) :]]
+    known = [*system.state_names, *system.input_names, *(p.name for p in system.parameters)]
+    inputs = [case.mean[name] + case.spread[name] for name in case.mean]
+    values = np.array([*start_state(page.name), *inputs, *column(page)])
+    size = np.array([*case.sizes, *case.spread.values(), *column(page)])
+    direction = np.random.default_rng(1).normal(size=len(known)) * size
     eps = 1e-6
 
     def at(shift: float) -> np.ndarray:
         cs.fmu.reset()
-        cs.start({n: x + shift * d for n, x, d in zip(known, values, direction, strict=True)})
+        cs.start(dict(zip(known, values + shift * direction, strict=True)))
         return np.array(cs.get(*unknown))
 
-    difference = (at(eps) - at(-eps)) / (2 * eps)
-    at(0.0)
+    difference, here = (at(eps) - at(-eps)) / (2 * eps), at(0.0)
     references = cs.references
     given = cs.fmu.getDirectionalDerivative(
         [references[n] for n in unknown], [references[n] for n in known], list(direction)
     )
-    np.testing.assert_allclose(given, difference, rtol=1e-7, atol=1e-7)
+    scale = np.abs(difference) + np.abs(here)
+    np.testing.assert_allclose(given / scale, difference / scale, atol=1e-7)
 
 
-def test_a_parameter_has_no_directional_derivative(cs: Instance) -> None:
-    cs.start()
-    r = cs.references["r"]
-    message = f"value reference {r} is no derivative or output"
-    refused(cs, message, cs.fmu.getDirectionalDerivative, [r], [0], [1.0])
-
-
-def test_no_directional_derivative_along_an_output(cs: Instance) -> None:
-    cs.start()
-    x = cs.references["x"]
-    refused(cs, f"value reference {x} is no state", cs.fmu.getDirectionalDerivative, [x], [x], [1.0])
-
-
-# ── Model Exchange ───────────────────────────────────────────────────────────────────────────────────────
-
-
-def continuous(made: Instance) -> None:
-    """Bring a Model Exchange instance into continuous-time mode."""
-    made.start()
-    info = made.fmu.newDiscreteStates()
-    assert not any(info[:5])
-    made.fmu.enterContinuousTimeMode()
-
-
-def test_model_exchange_derivatives_and_outputs_equal_the_plants(me: Instance) -> None:
-    continuous(me)
-    x = (c_double * 3)(*X0.values())
-    dx = (c_double * 3)()
-    me.fmu.setTime(0.5)
-    me.fmu.setContinuousStates(x, 3)
-    me.set("v", 7.0)
-    me.fmu.getDerivatives(dx, 3)
-    expected = evaluate(SYSTEM.derivative, list(X0.values()), [0.0, 7.0], DEFAULTS)[0]
-    np.testing.assert_allclose(list(dx), expected, rtol=1e-14)
-    me.fmu.getContinuousStates(dx, 3)
-    assert list(dx) == list(x)
-    me.fmu.getNominalsOfContinuousStates(dx, 3)
-    assert list(dx) == [1.0, 1.0, 1.0]
-    outputs = evaluate(PLANT.output, list(X0.values()), [0.0, 7.0], DEFAULTS)[0]
-    np.testing.assert_allclose(me.get(*(o.name for o in PLANT.output_list)), outputs, rtol=1e-14)
-
-
-def test_casadi_reads_the_fmu_as_a_function_with_exact_derivatives(fmu: Path, tmp_path: Path) -> None:
+def test_casadi_reads_the_fmu_as_a_function_with_exact_derivatives(
+    page: Plant, fmu: Path, tmp_path: Path
+) -> None:
+    """Through Model Exchange."""
     with zipfile.ZipFile(fmu) as archive:
         archive.extractall(tmp_path)
     ode = ca.DaeBuilder("plant", str(tmp_path)).create("ode", ["x", "u"], ["ode"])
-    x, u = list(X0.values()), [0.3, 7.0]
-    np.testing.assert_allclose(ode(x, u).full(), SYSTEM.derivative(x, u, DEFAULTS).full(), rtol=1e-14)
-    jacobian = SYSTEM.derivative.factory("jacobian", ["x", "u", "p"], ["jac:dx:x"])(x, u, DEFAULTS)
+    x, u, p = start_state(page.name), list(CASES[page.name].spread.values()), column(page)
+    np.testing.assert_allclose(ode(x, u).full(), page.system.derivative(x, u, p).full(), rtol=1e-14)
     given = ode.factory("jacobian", ["x", "u"], ["jac:ode:x"])(x, u)
-    np.testing.assert_allclose(given.full(), jacobian.full(), rtol=1e-13, atol=1e-15)
-
-
-def test_model_exchange_has_no_events(me: Instance) -> None:
-    continuous(me)
-    assert me.fmu.completedIntegratorStep() == (0, 0)
-    me.fmu.enterEventMode()
-    me.fmu.enterContinuousTimeMode()
-    me.fmu.terminate()
-
-
-def test_model_exchange_takes_no_steps(me: Instance) -> None:
-    continuous(me)
-    message = "fmi2DoStep may not be called in mode 'continuous time' of this Model Exchange instance"
-    status = me.fmu.dll.fmi2DoStep(c_void_p(me.fmu.component), c_double(0.0), c_double(MS), c_int(0))
-    assert status == 3
-    assert me.log[-1] == message
-
-
-def test_model_exchange_refuses_values_that_are_no_numbers(me: Instance) -> None:
-    continuous(me)
-    states = (c_double * 3)(0.0, float("nan"), 0.0)
-    refused(me, "alpha_dot was set to -?nan", me.fmu.setContinuousStates, states, 3)
-    refused(me, "the time was set to inf", me.fmu.setTime, float("inf"))
-    me.fmu.setContinuousStates((c_double * 3)(0.0, 1e200, 0.0), 3)
-    me.fmu.enterEventMode()
-    me.set("d", 1e200)
-    refused(me, "alpha_ddot is", me.fmu.getDerivatives, (c_double * 3)(), 3)
-
-
-def test_arrays_of_a_wrong_length_are_refused(me: Instance) -> None:
-    continuous(me)
-    fmu, array = me.fmu, (c_double * 4)()
-    for call in (
-        fmu.setContinuousStates,
-        fmu.getContinuousStates,
-        fmu.getDerivatives,
-        fmu.getNominalsOfContinuousStates,
-    ):
-        refused(me, "an array of 4 values was given, expected 3", call, array, 4)
-    refused(me, "an array of 4 values was given, expected 0", fmu.getEventIndicators, array, 4)
-
-
-# ── what is refused ──────────────────────────────────────────────────────────────────────────────────────
-
-
-def test_a_step_before_initialisation_is_refused(cs: Instance) -> None:
-    refused(cs, "fmi2DoStep may not be called in mode 'instantiated'", cs.fmu.doStep, 0.0, MS)
-
-
-@pytest.mark.parametrize("h", [0.0, -MS, float("nan"), float("inf")])
-def test_a_step_that_is_not_positive_is_refused(cs: Instance, h: float) -> None:
-    cs.start()
-    refused(cs, "the step size is .* expected a positive number", cs.fmu.doStep, 0.0, h)
-
-
-def test_a_step_from_another_time_is_refused(cs: Instance) -> None:
-    cs.start()
-    refused(cs, "the importer is at t = 0.5 s, this model at t = 0 s", cs.fmu.doStep, 0.5, MS)
-
-
-def test_a_step_past_the_stop_time_is_refused(cs: Instance) -> None:
-    cs.start(stop=0.0015)
-    cs.fmu.doStep(0.0, MS)
-    refused(cs, "goes past the stop time 0.0015 s", cs.fmu.doStep, MS, MS)
-
-
-def test_an_input_that_is_no_number_is_refused_by_name(cs: Instance) -> None:
-    cs.start()
-    refused(cs, r"v was set to -?nan at t = 0 s", cs.set, "v", float("nan"))
-
-
-def test_a_refused_set_sets_nothing(cs: Instance) -> None:
-    cs.start()
-    r = cs.references
-    refused(cs, "v was set to inf", cs.fmu.setReal, [r["tau_ext"], r["v"]], [1.0, float("inf")])
-    assert cs.get("tau_ext", "v") == [0.0, 0.0]
-
-
-@pytest.mark.parametrize("name", ["alpha", "x", "solver_step", "i_dot"])
-def test_what_follows_from_the_run_cannot_be_set_in_it(cs: Instance, name: str) -> None:
-    cs.start()
-    refused(cs, f"{name} may not be set in mode 'step complete'", cs.set, name, 1.0)
-
-
-def test_solver_step_must_be_positive(cs: Instance) -> None:
-    refused(cs, "solver_step was set to 0 s, expected a positive number", cs.set, "solver_step", 0.0)
-
-
-def test_parameters_that_make_no_sense_are_named_at_the_start(cs: Instance) -> None:
-    refused(cs, "i_dot is -?(nan|inf) at the start; check the parameters", cs.start, {"l": 0.0})
-
-
-def test_a_result_that_is_no_number_is_refused_by_name_and_the_state_is_kept(cs: Instance) -> None:
-    """An inductance of 1 µH makes a pole at −5·10⁶ 1/s, which steps of 1 ms cannot follow."""
-    cs.start({"l": 1e-6, "alpha_dot": 1.0})
-    message = "alpha is no longer finite .* make the parameter solver_step .* smaller"
-    refused(cs, message, cs.fmu.doStep, 0.0, 0.1)
-    assert cs.get(*STATES) == [0.0, 1.0, 0.0]
-
-
-def test_an_output_that_is_no_number_is_refused_by_name(cs: Instance) -> None:
-    cs.start({"i": 1e200})
-    refused(cs, "W_m is inf at t = 0 s", cs.get, "W_m")
-
-
-def test_an_unknown_value_reference_is_refused(cs: Instance) -> None:
-    refused(cs, "there is no value reference 99, the last one is 23", cs.fmu.getReal, [99])
-    refused(cs, "there is no value reference 99, the last one is 23", cs.fmu.setReal, [99], [1.0])
-
-
-def test_what_the_model_description_denies_is_refused(cs: Instance) -> None:
-    cs.start()
-    v = [cs.references["v"]]
-    refused(cs, "canInterpolateInputs is false", cs.fmu.setRealInputDerivatives, v, [1], [1.0])
-    refused(cs, "maxOutputDerivativeOrder is 0", cs.fmu.getRealOutputDerivatives, v, [1])
-    refused(cs, "steps are never pending", cs.fmu.cancelStep)
-
-
-def test_the_last_successful_time_is_reported(cs: Instance) -> None:
-    cs.start(t0=2.0)
-    cs.fmu.doStep(2.0, 0.25)
-    assert cs.fmu.getRealStatus(2) == 2.25
-    assert cs.fmu.getBooleanStatus(3) is False
-
-
-@pytest.mark.parametrize("type_name", ["Integer", "Boolean", "String"])
-def test_variables_of_another_type_are_refused(cs: Instance, type_name: str) -> None:
-    refused(cs, "all variables of this model are of type Real", getattr(cs.fmu, f"get{type_name}"), [0])
-
-
-def test_a_foreign_guid_is_refused(fmu: Path) -> None:
-    log: list[str] = []
-    with pytest.raises(Exception, match="instantiate"):
-        Instance(fmu, guid="{0%s}", log=log)
-    assert "the guid is {0?s}, expected {" in log[-1]
+    expected = page.system.state_jacobian(x, u, p).full()
+    np.testing.assert_allclose(given.full(), expected, rtol=1e-13, atol=1e-15)
