@@ -183,8 +183,9 @@ def write_learning(folder: Path, *, diverges: bool = False) -> pd.DataFrame:
     table.to_csv(folder / "parameters.csv", index=False)
     metrics = {
         "learn.force_mse_test": 3.1e-10,
-        "learn.rollout_nrmse_10s": 2.4e-5,
+        "learn.rollout_nrmse_10s": np.inf if diverges else 2.4e-5,
+        "learn.rollout_diverged": float(diverges),
         "identify.max_rel_error": 5e-5,
     }
-    write_json(folder / "metrics.json", metrics | ({"learn.rollout_nrmse_10s": np.inf} if diverges else {}))
+    write_json(folder / "metrics.json", metrics)
     return frame

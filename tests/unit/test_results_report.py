@@ -216,10 +216,20 @@ def test_a_failed_run_says_so_first(tmp_path: Path) -> None:
     assert text.index("The run failed.") < text.index("Closed loop")
 
 
-def test_metrics_that_are_not_finite_say_so(tmp_path: Path) -> None:
+def test_a_free_run_that_diverged_says_so(tmp_path: Path) -> None:
     folder = make_run(tmp_path, learn=True)
     write_learning(folder, diverges=True)
-    assert "error relative to the signalno finite valuelearn.rollout_nrmse_10s" in page(folder).text
+    text = page(folder).text
+    assert "error relative to the signaldivergedlearn.rollout_nrmse_10s" in text
+    assert "divergedFree run over 10 s" in text
+
+
+def test_what_could_not_be_judged_is_a_dash_and_no_headline(tmp_path: Path) -> None:
+    folder = make_run(tmp_path, learn=True)
+    write_json(folder / "metrics.json", {"learn.force_mse_test": 1e-3, "identify.max_rel_error": None})
+    text = page(folder).text
+    assert "of an identified parameter–identify.max_rel_error" in text
+    assert "–Largest relative error" not in text
 
 
 def test_parameters_without_true_value_show_a_dash(tmp_path: Path) -> None:
