@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -15,6 +17,7 @@ from scipy.integrate import solve_ivp
 
 from exlinn_fmi.components.lagrangian import LagrangianComponent
 from exlinn_fmi.errors import ModelError
+from exlinn_fmi.export.model import plant_model
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import MAX_INTERNAL_STEP, LagrangianSystem, evaluate
 from exlinn_fmi.mechanics.friction import log_cosh
@@ -142,6 +145,18 @@ def test_every_output_has_a_description_beyond_states_and_accelerations(page: Pl
     own = page.output_list[len(page.system.state_names) + page.system.n :]
     assert all(o.description for o in own)
     assert all(p.description for p in page.parameters)
+
+
+@every_plant
+def test_the_readme_lists_each_variable_of_the_fmu_with_unit_and_start(page: Plant, root: Path) -> None:
+    text = (root / "fmus" / "README.md").read_text(encoding="utf-8")
+    section = text.split(f"## {page.model_name}.fmu\n")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| `(\w+)` \| (\S+) \| (\S*) ?\|", section, re.MULTILINE)
+    model = plant_model(page)
+    expected = {(q.name, q.unit) for q in model.variables if not q.name.startswith("der(")}
+    assert {(name, unit) for name, unit, _ in rows} == expected
+    starts = {q.name: q.start for q in model.known} | {"solver_step": model.solver_step}
+    assert {n: float(s) for n, _, s in rows if s} == pytest.approx(starts, rel=1e-5)
 
 
 # ── magnetic levitation ──────────────────────────────────────────────────────────────────────────────────

@@ -12,6 +12,7 @@ from jsonschema import Draft202012Validator
 from scenario_helpers import SCENARIO
 
 from exlinn_fmi.components.base import Variable
+from exlinn_fmi.components.fmu import read_variables
 from exlinn_fmi.components.lagrangian import variables_of
 from exlinn_fmi.components.python import load_python_component
 from exlinn_fmi.control.controller import NmpcController
@@ -39,10 +40,12 @@ VALIDATOR = Draft202012Validator(json_schema())
 
 
 def inspect(spec: object, folder: Path) -> tuple[Variable, ...]:
-    """Variables of the motor's FMU as fmus/README.md lists them, and of Python components as they are."""
+    """Variables of the motor's FMU as fmus/README.md lists them, and of everything else as they are."""
     if isinstance(spec, PythonComponentSpec):
         return load_python_component(spec.python, "part", spec.options, folder).variables
     assert isinstance(spec, FmuComponent)
+    if Path(spec.fmu).stem not in ("DCMotorCart", "Theirs"):
+        return read_variables(folder / spec.fmu)
     inputs = {"tau_ext": "N.m", "v": "V"}
     states = {"alpha": "rad", "alpha_dot": "rad/s", "i": "A"}
     outputs = {"alpha_ddot": "rad/s2", "i_dot": "A/s", "x": "m", "x_dot": "m/s", "tau_e": "N.m"}
