@@ -97,18 +97,18 @@ class Solver(ABC):
         Args:
             x0: measured state, shape (n,).
             references: what to follow.
-            guess: plan to start from, usually the last one shifted; None: start from the reference, and where
-                that leads nowhere from standing still.
+            guess: plan to start from, usually the last one shifted; where there is none or it leads nowhere,
+                the reference is what is started from, then standing still.
         """
         targets = self.ocp.targets(references)
-        if guess is not None:
-            return self._from(x0, guess, targets, cold=False)
-        solution = self._from(x0, Plan(targets.x, targets.u), targets, cold=True)
-        if solution.status != SolveStatus.FAILED:
-            return solution
-        # A reference that cannot be reached may be where the model says nothing: try from where we are.
+        # Plan and reference may lead where the model predicts nothing: then try from where we are.
         stay = Plan(np.tile(x0, (self.ocp.horizon + 1, 1)), np.zeros_like(targets.u))
-        return self._from(x0, stay, targets, cold=True)
+        starts = [] if guess is None else [guess]
+        for start in (*starts, Plan(targets.x, targets.u), stay):
+            solution = self._from(x0, start, targets, cold=start is not guess)
+            if solution.status != SolveStatus.FAILED:
+                break
+        return solution
 
     def _from(self, x0: Float[np.ndarray, " n"], guess: Plan, targets: Targets, cold: bool) -> Solution:
         """Solve from a plan that need be neither finite nor within bounds."""
@@ -285,6 +285,8 @@ class Ipopt(Solver):
             {
                 "error_on_fail": False,
                 "print_time": False,
+                "show_eval_warnings": False,
+                "calc_lam_p": False,
                 "ipopt": {
                     "print_level": 0,
                     "sb": "yes",

@@ -171,6 +171,16 @@ def test_a_reference_beyond_the_models_edge_is_approached_from_standing_still():
     np.testing.assert_allclose(found.u, 0.5)
 
 
+def test_a_plan_beyond_the_models_edge_is_given_up_for_the_reference():
+    solver, references = problem(edge(), "rti", reference=REST)
+    x0 = np.array([0.1, 0.0])
+    made = references.over(0.0, x0, 0)
+    lost = Plan(np.full_like(made.x, 5.0), made.u)
+    found = solver.solve(x0, made, lost)
+    assert found.status == SolveStatus.SOLVED
+    np.testing.assert_allclose(found.u, solver.solve(x0, made).u)
+
+
 def test_a_step_beyond_the_models_edge_is_shortened():
     found = solve("sqp", edge(), [0.9, 8.0], reference=REST, iterations=200)
     assert found.status in (SolveStatus.SOLVED, SolveStatus.LIMIT, SolveStatus.FAILED)
@@ -204,10 +214,11 @@ def test_a_plan_that_is_not_finite_fails_as_a_status():
     solver.qp = Wild()
     x0 = np.array([1.0, 0.0, 0.0])
     made = references.over(0.0, x0, 0)
-    with np.errstate(over="ignore"):
+    with np.errstate(all="ignore"):
+        once = solver._from(x0, Plan(made.x, made.u), solver.ocp.targets(made), cold=False)
         found = solver.solve(x0, made, Plan(made.x, made.u))
-    assert found.status == SolveStatus.FAILED
-    assert found.stats.message == "the plan is not finite"
+    assert once.stats.message == "the plan is not finite"
+    assert once.status == found.status == SolveStatus.FAILED
 
 
 def test_without_ipopt_the_error_names_another_solver(monkeypatch):
