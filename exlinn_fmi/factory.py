@@ -40,7 +40,7 @@ def inspect(spec: ComponentBase, folder: Path) -> Sequence[Variable]:
         return read_variables(folder / spec.fmu, runnable=True)
     if isinstance(spec, NmpcComponent):
         return nmpc_variables(model_system(spec.nmpc.model, folder, folder).coordinates, spec.nmpc)
-    component = make("component", spec, folder, folder, 1.0)
+    component = make("component", spec, folder, folder)
     try:
         return component.variables
     finally:
@@ -60,12 +60,19 @@ def build(name: str, scenario: Scenario, folder: Path, run_folder: Path) -> Comp
         InputError: the component cannot be made; the message says why.
     """
     spec = scenario.components[name]
-    master_step = scenario.simulate.step if scenario.simulate else 1e-3
-    return make(name, spec, folder, run_folder, spec.step or master_step)
+    if not isinstance(spec, NmpcComponent):
+        return make(name, spec, folder, run_folder)
+    from exlinn_fmi.control.controller import NmpcController
+
+    # An input that is connected to nothing acts on nothing: the controller must not count on it.
+    driven = {path.split(".", 1)[1] for path, _ in scenario.connection_list() if path.startswith(f"{name}.")}
+    system = model_system(spec.nmpc.model, folder, run_folder).with_inputs(driven)
+    step = spec.step or (scenario.simulate.step if scenario.simulate else 1e-3)
+    return NmpcController(name, system, spec.nmpc, step, folder)
 
 
-def make(name: str, spec: ComponentBase, folder: Path, run_folder: Path, step: float) -> Component:
-    """Make a component from its section; `step` [s] is its communication step."""
+def make(name: str, spec: ComponentBase, folder: Path, run_folder: Path) -> Component:
+    """Make a component from its section alone."""
     # Each kind brings libraries of its own; none is loaded before it is used.
     if isinstance(spec, FmuComponent):
         from exlinn_fmi.components.fmu import FmuComponent as Fmu
@@ -86,12 +93,6 @@ def make(name: str, spec: ComponentBase, folder: Path, run_folder: Path, step: f
         return SignalSource(name, spec.source, folder)
     if isinstance(spec, PythonComponentSpec):
         return load_python_component(spec.python, name, spec.options, folder)
-    if isinstance(spec, NmpcComponent):
-        from exlinn_fmi.control.controller import NmpcController
-
-        return NmpcController(
-            name, model_system(spec.nmpc.model, folder, run_folder), spec.nmpc, step, folder
-        )
     raise TypeError(f"no component for {type(spec).__name__}")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -34,18 +33,9 @@ CART = Reference(
 LIMITS = {"inputs": {"v": Bounds(min=-24.0, max=24.0)}, "states": {"i": Bounds(min=-4.0, max=4.0)}}
 
 
-def without_input(system: LagrangianSystem, *names: str) -> LagrangianSystem:
-    """The system with these inputs gone."""
-    coordinates = tuple(
-        dataclasses.replace(c, input=None, input_unit="") if c.input in names else c
-        for c in system.coordinates
-    )
-    return dataclasses.replace(system, coordinates=coordinates)
-
-
 def motor_cart() -> LagrangianSystem:
     """The paper's plant, driven by its voltage alone."""
-    return without_input(PLANT.system, "tau_ext")
+    return PLANT.system.with_inputs(["v"])
 
 
 def oscillator() -> LagrangianSystem:

@@ -10,8 +10,8 @@ paper's (11a) misprints ∂𝓛/∂q as ∂𝓛/∂q̇; forward model (16); inve
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -105,6 +105,17 @@ class LagrangianSystem:
             ca.Function("D", [v, p], [dissipation(v, p)], ["v", "p"], ["D"]),
             parameters,
         )
+
+    def with_inputs(self, names: Collection[str]) -> LagrangianSystem:
+        """The same system with these of its inputs alone; on the others no force acts.
+
+        Args:
+            names: inputs to keep.
+        """
+        coordinates = tuple(
+            c if c.input in names else replace(c, input=None, input_unit="") for c in self.coordinates
+        )
+        return replace(self, coordinates=coordinates)
 
     # ── names and sizes ──────────────────────────────────────────────────────────────────────────────────
 
