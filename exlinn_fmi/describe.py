@@ -52,6 +52,7 @@ def describe_scenario(file: Path, overrides: Sequence[str]) -> str:
     from exlinn_fmi.cosim.graph import Graph
     from exlinn_fmi.factory import outline
     from exlinn_fmi.pipeline import Run
+    from exlinn_fmi.scenario.schema import LearnFromData
 
     work = Run.open(file, None, overrides)
     components = {name: outline(name, work.scenario, work.loaded.folder) for name in work.scenario.components}
@@ -59,9 +60,15 @@ def describe_scenario(file: Path, overrides: Sequence[str]) -> str:
     if work.scenario.learn:
         learn = work.scenario.learn
         names = ", ".join(c.name for c in learn.coordinates)
-        experiments = f"{len(learn.training)} training experiments, {len(learn.test)} tests"
-        lines.append(f"learns {learn.plant} in {names}: {experiments}")
-    lines.append(Graph(components, work.scenario.connection_list()).describe())
+        if isinstance(learn, LearnFromData):
+            tests = learn.data.hold_out or len(learn.data.test)
+            training = len(learn.data.files) - learn.data.hold_out
+            lines.append(f"learns from measured data in {names}: {training} training files, {tests} tests")
+        else:
+            experiments = f"{len(learn.training)} training experiments, {len(learn.test)} tests"
+            lines.append(f"learns {learn.plant} in {names}: {experiments}")
+    if components:
+        lines.append(Graph(components, work.scenario.connection_list()).describe())
     return "\n".join(lines)
 
 

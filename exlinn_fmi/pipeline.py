@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from exlinn_fmi.cosim.master import Trajectories
     from exlinn_fmi.data.dataset import Dataset
-    from exlinn_fmi.scenario.schema import Experiment, Learn, Scenario, Simulate
+    from exlinn_fmi.scenario.schema import AnyLearn, Experiment, LearnFromPlant, Scenario, Simulate
 
 COMPARED = ("L", "D")
 """Plant outputs that, where there are any of that name, the report compares the learned 𝓛 and D with."""
@@ -108,7 +108,7 @@ class Run:
         return Stages(self.folder)
 
     @property
-    def learn(self) -> Learn:
+    def learn(self) -> AnyLearn:
         """The scenario's `learn` section.
 
         Raises:
@@ -117,6 +117,11 @@ class Run:
         if self.scenario.learn is None:
             raise InputError(f"{self.loaded.file}: this needs a `learn` section, and the scenario has none")
         return self.scenario.learn
+
+    @property
+    def seed(self) -> int:
+        """The seed of learning."""
+        return self.learn.seed if self.learn.seed is not None else self.scenario.seed
 
     def component(self, name: str) -> Component:
         """Make a component of the scenario."""
@@ -185,32 +190,65 @@ def run(work: Run) -> dict[str, Any]:
 
 
 def collect(work: Run) -> Dataset:
-    """Excite the plant through the master as `learn.training` and `learn.test` say; save the data set.
+    """Bring the data together, from experiments on the plant or from measured files; save the data set.
+
+    Raises:
+        InputError: the files cannot be used.
+        RunError: the plant failed, or the user stopped the run; the rows so far are on disk.
+    """
+    from exlinn_fmi.data.dataset import load_dataset, save_dataset
+    from exlinn_fmi.data.measured import import_measured
+    from exlinn_fmi.scenario.schema import LearnFromData
+
+    learn = work.learn
+    coordinates = tuple(c.coordinate() for c in learn.coordinates)
+    if isinstance(learn, LearnFromData):
+        detail = f"{len(learn.data.files) + len(learn.data.test)} measured files"
+        key = fingerprint(learn.data, learn.coordinates, work.seed, files=work.files(learn.data))
+    else:
+        experiments = [*learn.training, *learn.test]
+        spec = work.scenario.components[learn.plant]
+        detail = f"{len(experiments)} experiments on {learn.plant}"
+        key = fingerprint(
+            spec, learn.plant, learn.coordinates, experiments, files=work.files(spec, experiments)
+        )
+    if work.unchanged("collect", key, detail):
+        dataset = load_dataset(work.folder)
+        for note in dataset.notes:
+            work.warn(note)
+        return dataset
+    began = time.perf_counter()
+    try:
+        if isinstance(learn, LearnFromData):
+            dataset = import_measured(learn.data, coordinates, work.loaded.folder, work.seed)
+        else:
+            dataset = experiment(work, learn)
+    except ExlinnError as error:
+        raise work.failed("collect", error) from None
+    for note in dataset.notes:
+        work.warn(note)
+    work.done("collect", key, save_dataset(work.folder, dataset), began)
+    return dataset
+
+
+def experiment(work: Run, learn: LearnFromPlant) -> Dataset:
+    """Excite the plant through the master as `learn.training` and `learn.test` say.
 
     Raises:
         RunError: the plant failed, or the user stopped the run; the rows so far are on disk.
     """
-    from exlinn_fmi.data.dataset import Dataset, load_dataset, save_dataset
+    from exlinn_fmi.data.dataset import Dataset
 
-    learn = work.learn
-    experiments = [*learn.training, *learn.test]
-    spec = work.scenario.components[learn.plant]
-    settings = (spec, learn.plant, learn.coordinates, experiments)
-    key = fingerprint(*settings, files=work.files(spec, experiments))
-    if work.unchanged("collect", key, f"{len(experiments)} experiments on {learn.plant}"):
-        return load_dataset(work.folder)
-    began, runs = time.perf_counter(), []
-    for experiment in experiments:
-        runs.append(excite(work, experiment))
-        error = runs[-1].error
-        if error is not None:
+    runs: list[Trajectories] = []
+    for spec in (*learn.training, *learn.test):
+        runs.append(excite(work, learn, spec))
+        if runs[-1].error is not None:
             write_table(work.folder / "dataset", table(learn, runs), units(learn, runs[0]))
-            raise work.failed("collect", error)
+            raise runs[-1].error
     coordinates = tuple(c.coordinate() for c in learn.coordinates)
     columns = {str(name): values.to_numpy() for name, values in table(learn, runs).items()}
-    dataset = Dataset.from_columns(columns, coordinates, units(learn, runs[0]))
-    work.done("collect", key, save_dataset(work.folder, dataset), began)
-    return dataset
+    held_out = tuple(range(len(learn.training), len(runs)))
+    return replace(Dataset.from_columns(columns, coordinates, units(learn, runs[0])), held_out=held_out)
 
 
 def train(work: Run) -> None:
@@ -219,8 +257,7 @@ def train(work: Run) -> None:
     Raises:
         RunError: no usable model came of it.
     """
-    learn, dataset = work.learn, collect(work)
-    seed = learn.seed if learn.seed is not None else work.scenario.seed
+    learn, dataset, seed = work.learn, collect(work), work.seed
     key = fingerprint(learn, seed, truth(work), work.stages.key("collect"))
     if work.unchanged("train", key, f"preset {learn.method.preset}"):
         return
@@ -233,9 +270,8 @@ def train(work: Run) -> None:
     def show(at: TrainProgress) -> None:
         work.reporter.update(at.fraction, f"loss {at.loss:.2e}, validation {at.validation_loss:.2e}")
 
-    began, count = time.perf_counter(), len(learn.training)
-    tests = [dataset.select([count + k]) for k in range(len(learn.test))]
-    part, validation = split(dataset.select(range(count)), learn.train_fraction, learn.split_blocks, seed)
+    began, tests = time.perf_counter(), dataset.tests
+    part, validation = split(dataset.training, learn.train_fraction, learn.split_blocks, seed)
     model = fit(part, validation, learn.method, seed, show, work.stop)
     written = save_model(work.folder, model)
     card = report_card(model, part, tests, learn.identify, truth(work))
@@ -317,12 +353,12 @@ def cosimulate(
     return master.run(starts, lambda part, t: work.reporter.update(part, f"t = {t:.3f} s"), work.stop)
 
 
-def excite(work: Run, experiment: Experiment) -> Trajectories:
+def excite(work: Run, learn: LearnFromPlant, experiment: Experiment) -> Trajectories:
     """Run one experiment on the plant: a source on each driven input, all that learning needs recorded."""
     from exlinn_fmi.components.signals import SignalSource
     from exlinn_fmi.scenario.schema import Simulate
 
-    learn, plant = work.learn, work.learn.plant
+    plant = learn.plant
     components = {plant: work.component(plant)}
     connections = []
     for k, (target, signal) in enumerate(experiment.inputs.items()):
@@ -336,7 +372,7 @@ def excite(work: Run, experiment: Experiment) -> Trajectories:
     return cosimulate(work, components, connections, span, starts)
 
 
-def table(learn: Learn, runs: Sequence[Trajectories]) -> pd.DataFrame:
+def table(learn: LearnFromPlant, runs: Sequence[Trajectories]) -> pd.DataFrame:
     """All experiments in one table: trajectory number, time, and the plant's variables by their own names."""
     import pandas as pd
 
@@ -346,13 +382,17 @@ def table(learn: Learn, runs: Sequence[Trajectories]) -> pd.DataFrame:
     return pd.concat(frames, ignore_index=True)
 
 
-def units(learn: Learn, run: Trajectories) -> dict[str, str]:
+def units(learn: LearnFromPlant, run: Trajectories) -> dict[str, str]:
     """Units of the columns of `table`."""
     return {name.removeprefix(f"{learn.plant}."): unit for name, unit in run.units.items()}
 
 
 def truth(work: Run) -> dict[str, float]:
     """Values of the plant's parameters, as far as it states them; the scenario's start values count."""
+    from exlinn_fmi.scenario.schema import LearnFromPlant
+
+    if not isinstance(work.learn, LearnFromPlant):
+        return {}
     spec = work.scenario.components[work.learn.plant]
     stated = {
         v.name: v.start

@@ -50,6 +50,8 @@ class Dataset:
         frame: the columns that the head of this module names; the index is 0, 1, 2, ….
         coordinates: the generalised coordinates.
         units: unit by column name; those of the coordinates are filled in.
+        held_out: trajectories that training never sees.
+        notes: what the user should know of where the data came from.
 
     Raises:
         DataError: a column is missing or not numeric, a value is not finite, or time does not increase.
@@ -58,6 +60,8 @@ class Dataset:
     frame: pd.DataFrame
     coordinates: tuple[Coordinate, ...]
     units: Mapping[str, str] = field(default_factory=dict)
+    held_out: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_coordinates(self.coordinates)
@@ -115,6 +119,16 @@ class Dataset:
     def trajectories(self) -> list[int]:
         """Numbers of the trajectories, in the order of the rows."""
         return [int(k) for k in self.frame["trajectory"].unique()]
+
+    @property
+    def training(self) -> Dataset:
+        """The data set of the trajectories that are not held out."""
+        return self.select(set(self.trajectories) - set(self.held_out))
+
+    @property
+    def tests(self) -> list[Dataset]:
+        """The trajectories that are held out, each as a data set."""
+        return [self.select([number]) for number in self.held_out]
 
     def select(self, trajectories: Iterable[int]) -> Dataset:
         """The data set of some of the trajectories."""
@@ -306,14 +320,20 @@ def check_excitation(dataset: Dataset) -> None:
 
 
 def save_dataset(folder: Path, dataset: Dataset) -> list[Path]:
-    """Write dataset.csv, dataset.parquet and dataset.meta.json (units, coordinates); return their paths.
+    """Write dataset.csv, dataset.parquet and dataset.meta.json (units, coordinates, …); return their paths.
 
     Raises:
         StorageError: one of them could not be written.
     """
     write_table(folder / "dataset", dataset.frame, dataset.units)
     meta = folder / "dataset.meta.json"
-    write_json(meta, {"units": dataset.units, "coordinates": [asdict(c) for c in dataset.coordinates]})
+    content = {
+        "units": dataset.units,
+        "coordinates": [asdict(c) for c in dataset.coordinates],
+        "held_out": dataset.held_out,
+        "notes": dataset.notes,
+    }
+    write_json(meta, content)
     return [folder / "dataset.csv", folder / "dataset.parquet", meta]
 
 
@@ -326,7 +346,9 @@ def load_dataset(folder: Path) -> Dataset:
     frame, units = read_table(folder / "dataset")
     meta = folder / "dataset.meta.json"
     try:
-        coordinates = tuple(Coordinate(**c) for c in read_json(meta)["coordinates"])
+        content = read_json(meta)
+        coordinates = tuple(Coordinate(**c) for c in content["coordinates"])
+        held_out, notes = tuple(content.get("held_out", ())), tuple(content.get("notes", ()))
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise DataError(f"{meta}: no coordinates can be read from it ({error}); collect again") from error
-    return Dataset(frame, coordinates, units)
+    return Dataset(frame, coordinates, units, held_out, notes)

@@ -8,12 +8,23 @@ from fnmatch import fnmatchcase
 from exlinn_fmi.components.base import Variable
 from exlinn_fmi.components.starts import takes_start, value_problem
 from exlinn_fmi.scenario.explain import Finding
+from exlinn_fmi.scenario.schema import LearnFromData
 from exlinn_fmi.scenario.survey import Survey
 from exlinn_fmi.scenario.units import same_unit
 from exlinn_fmi.scenario.words import KeyPath, suggestion
 
 _FITS = {("Integer", "Enumeration"), ("Enumeration", "Integer"), ("Boolean", "Integer")}
 """Pairs of types, from and to, between which no value is lost; a Real takes any."""
+
+
+def components(survey: Survey) -> Iterator[Finding]:
+    """A scenario without components that does more than learn from data."""
+    scenario, cut = survey.scenario, survey.sound.cut
+    learns_only = isinstance(scenario.learn, LearnFromData) or ("learn",) in cut
+    simulates = scenario.simulate is not None or ("simulate",) in cut
+    if survey.names or survey.sound.in_doubt((), "components") or (learns_only and not simulates):
+        return
+    yield (), "missing key 'components': what takes part, by name"
 
 
 def connections(survey: Survey) -> Iterator[Finding]:

@@ -12,17 +12,18 @@ from exlinn_fmi.mechanics.coordinates import Coordinate, check_coordinates
 from exlinn_fmi.scenario.check_graph import is_multiple, misfit_starts, no_multiple
 from exlinn_fmi.scenario.explain import Finding
 from exlinn_fmi.scenario.schema import (
+    AnyLearn,
     Bounds,
     Chirp,
-    CoordinateSpec,
     Experiment,
     Identify,
-    Learn,
+    LearnFromPlant,
     ModelComponent,
     Multisine,
     Nmpc,
     NmpcComponent,
     Paper,
+    PlantCoordinate,
     Ramp,
     Signal,
     SignalComponent,
@@ -69,17 +70,13 @@ def _signal(at: KeyPath, signal: Signal, folder: Path) -> Iterator[Finding]:
 
 
 def learning(survey: Survey) -> Iterator[Finding]:
-    """A `learn` section that does not fit its plant."""
+    """A `learn` section that does not fit its plant, or what cannot be learned wherever the data are from."""
     learn = survey.scenario.learn
     if learn is None:
         return
-    problem = _wrong_plant(learn, survey)
-    if problem:
-        yield ("learn", "plant"), problem
-    plant = None if problem else learn.plant
-    found = [f for k, c in enumerate(learn.coordinates) for f in _coordinate(k, c, plant, survey)]
+    found = list(_from_plant(learn, survey)) if isinstance(learn, LearnFromPlant) else []
     yield from found
-    if not found:
+    if not any(at[:2] == ("learn", "coordinates") for at, _ in found):
         if all(c.input is None for c in learn.coordinates) and not _in_coordinates(survey):
             message = "none has an `input`; without a known force or voltage the model's scale stays open"
             yield ("learn", "coordinates"), message
@@ -87,9 +84,19 @@ def learning(survey: Survey) -> Iterator[Finding]:
             check_coordinates(tuple(c.coordinate() for c in learn.coordinates))
         except ModelError as error:
             yield ("learn", "coordinates"), str(error)
+    yield from _monomials(learn, survey.coordinates)
+
+
+def _from_plant(learn: LearnFromPlant, survey: Survey) -> Iterator[Finding]:
+    """Coordinates and experiments that do not fit the plant."""
+    problem = _wrong_plant(learn, survey)
+    if problem:
+        yield ("learn", "plant"), problem
+    plant = None if problem else learn.plant
+    for k, c in enumerate(learn.coordinates):
+        yield from _coordinate(k, c, plant, survey)
     for at, experiment in _experiments(learn):
         yield from _experiment(at, experiment, plant, survey)
-    yield from _monomials(learn, survey.coordinates)
 
 
 def _in_coordinates(survey: Survey) -> bool:
@@ -97,7 +104,7 @@ def _in_coordinates(survey: Survey) -> bool:
     return any(path[:2] == ("learn", "coordinates") for path in survey.sound.cut)
 
 
-def _wrong_plant(learn: Learn, survey: Survey) -> str | None:
+def _wrong_plant(learn: LearnFromPlant, survey: Survey) -> str | None:
     """Why the component to learn cannot be that, None where it can."""
     name, plant = learn.plant, survey.scenario.components.get(learn.plant)
     if name not in survey.names and survey.names_are_known:
@@ -114,7 +121,7 @@ def _wrong_plant(learn: Learn, survey: Survey) -> str | None:
     return None
 
 
-def _coordinate(k: int, spec: CoordinateSpec, plant: str | None, survey: Survey) -> Iterator[Finding]:
+def _coordinate(k: int, spec: PlantCoordinate, plant: str | None, survey: Survey) -> Iterator[Finding]:
     """Plant variables of a coordinate that are not there, or not what they are said to be."""
     at: KeyPath = ("learn", "coordinates", k)
     if spec.position is None and spec.topology != "cyclic" and not _in_coordinates(survey):
@@ -156,8 +163,8 @@ def _plant_variable(
     return variable, problem
 
 
-def _experiments(learn: Learn | None) -> Iterator[tuple[KeyPath, Experiment]]:
-    if learn is not None:
+def _experiments(learn: AnyLearn | None) -> Iterator[tuple[KeyPath, Experiment]]:
+    if isinstance(learn, LearnFromPlant):
         for section, experiments in (("training", learn.training), ("test", learn.test)):
             yield from ((("learn", section, k), experiment) for k, experiment in enumerate(experiments))
 
@@ -189,7 +196,7 @@ def _experiment(at: KeyPath, experiment: Experiment, plant: str | None, survey: 
         yield from misfit_starts((*at, "start"), experiment.start, plant, known)
 
 
-def _monomials(learn: Learn, coordinates: tuple[Coordinate, ...]) -> Iterator[Finding]:
+def _monomials(learn: AnyLearn, coordinates: tuple[Coordinate, ...]) -> Iterator[Finding]:
     """Features and terms that cannot be read, or that name what the model does not have."""
     if not coordinates:
         return

@@ -15,8 +15,16 @@ from typing import Any, get_args
 from pydantic import Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from exlinn_fmi.scenario.places import Place, alternatives, entry, is_model, kind_field, locate
-from exlinn_fmi.scenario.schema import COMPONENT_KEYS, ComponentBase, ComponentSpec, Scenario, Spec
+from exlinn_fmi.scenario.places import (
+    Place,
+    alternatives,
+    entry,
+    is_model,
+    kind_field,
+    locate,
+    telling_keys,
+)
+from exlinn_fmi.scenario.schema import ComponentBase, ComponentSpec, Scenario, Spec
 from exlinn_fmi.scenario.words import KeyPath, closest, either, found, listing, suggestion
 
 Finding = tuple[KeyPath, str]
@@ -185,11 +193,15 @@ def _missing(place: Place) -> Finding | None:
 def _unknown_key(place: Place) -> str:
     key, model = str(place.path[-1]), place.model
     assert model is not None
-    valid = list(model.model_fields)
-    if issubclass(model, ComponentBase) and key in COMPONENT_KEYS:
-        kinds = [repr(k) for k in COMPONENT_KEYS if k in place.siblings]
-        return f"a component is of one kind, and this has the keys {' and '.join(kinds)}; keep one of them"
-    return f"unknown key {key!r}{suggestion(key, valid, 'valid keys')}"
+    forms = telling_keys(model)
+    kinds = [k for k in forms if k in place.siblings]
+    if key in forms:
+        one = "a component is of one kind" if issubclass(model, ComponentBase) else "a model has one source"
+        return f"{one}, and this has the keys {' and '.join(map(repr, kinds))}; keep one of them"
+    owners = [repr(k) for k, other in forms.items() if key in other.model_fields]
+    if owners:
+        return f"{key!r} goes with {either(owners)}, and this has {kinds[0]!r}; take it out"
+    return f"unknown key {key!r}{suggestion(key, list(model.model_fields), 'valid keys')}"
 
 
 def _no_form(place: Place) -> Finding:
@@ -200,9 +212,8 @@ def _no_form(place: Place) -> Finding:
         hint = _number_hint(expected, value)
         return place.path, f"expected {expected}, found {found(value)}{hint}"
     key = kind_field(forms[0])
-    kinds = (
-        list(COMPONENT_KEYS) if key is None else [_literals(f.model_fields[key].annotation)[0] for f in forms]
-    )
+    telling = list(telling_keys(forms[0]))
+    kinds = telling if key is None else [_literals(f.model_fields[key].annotation)[0] for f in forms]
     if not isinstance(value, Mapping):
         what = f"one of the keys {', '.join(kinds)}" if key is None else f"a key {key!r}: {either(kinds)}"
         return place.path, f"expected a mapping with {what}, found {found(value)}"
@@ -213,10 +224,9 @@ def _no_form(place: Place) -> Finding:
     if typo is not None:
         return (*place.path, typo), f"unknown key {typo!r}{suggestion(typo, names)}"
     if key is None:
-        return (
-            place.path,
-            f"nothing says what kind of component this is; give one of the keys {', '.join(kinds)}",
-        )
+        is_component = issubclass(forms[0], ComponentBase)
+        what = "what kind of component this is" if is_component else "what to learn from"
+        return place.path, f"nothing says {what}; give one of the keys {', '.join(kinds)}"
     return place.path, f"missing key {key!r}{listing(kinds, 'one of')}"
 
 

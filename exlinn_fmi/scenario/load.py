@@ -11,13 +11,14 @@ from typing import Any
 from pydantic import BaseModel
 
 from exlinn_fmi.errors import Problem, ScenarioError
-from exlinn_fmi.scenario import check_graph, check_learn
+from exlinn_fmi.scenario import check_data, check_graph, check_learn
 from exlinn_fmi.scenario.document import Document, parse
 from exlinn_fmi.scenario.editor import json_schema
 from exlinn_fmi.scenario.explain import Finding, schema_findings
 from exlinn_fmi.scenario.overrides import apply
 from exlinn_fmi.scenario.schema import (
     FmuComponent,
+    Measured,
     ModelComponent,
     NmpcComponent,
     PythonComponentSpec,
@@ -30,6 +31,7 @@ from exlinn_fmi.scenario.words import KeyPath, key_path, missing_file
 __all__ = ["Inspect", "LoadedScenario", "json_schema", "load_scenario", "named_files"]
 
 CHECKS = (
+    check_graph.components,
     check_graph.connections,
     check_graph.start_values,
     check_graph.steps,
@@ -37,6 +39,7 @@ CHECKS = (
     check_learn.signals,
     check_learn.learning,
     check_learn.control,
+    check_data.measured,
 )
 
 
@@ -141,6 +144,8 @@ def _named(section: object, folder: Path | None) -> Iterator[str]:
         yield section.fmu
     elif isinstance(section, Table):
         yield section.file
+    elif isinstance(section, Measured):
+        yield from (*section.files, *section.test)
     elif isinstance(section, PythonComponentSpec):
         module = section.python.split(":")[0].replace(".", "/") + ".py"
         if folder is not None and (folder / module).is_file():

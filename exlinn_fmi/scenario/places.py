@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeGuard, Union, get_args, get_origin
 
-from exlinn_fmi.scenario.schema import COMPONENT_KEYS, ComponentBase, Scenario, Spec, component_kind
+from exlinn_fmi.scenario.schema import COMPONENT_KEYS, LEARN_KEYS, Scenario, Spec, telling_key
 from exlinn_fmi.scenario.words import KeyPath
 
 
@@ -37,6 +37,11 @@ def kind_field(model: type[Spec]) -> str | None:
     return None
 
 
+def telling_keys(model: Any) -> Mapping[str, type[Spec]]:
+    """The keys one of which tells which of several sections is meant, and what they make; {} if none does."""
+    return next((keys for keys in (COMPONENT_KEYS, LEARN_KEYS) if model in keys.values()), {})
+
+
 def choose(annotation: Any, value: Any) -> Any:
     """The form that a value is meant to have, judging by its kind key or by what it is; None if open."""
     forms = alternatives(annotation)
@@ -47,10 +52,10 @@ def _meant(annotation: Any, value: Any) -> bool:
     if is_model(annotation):
         if not isinstance(value, Mapping):
             return False
-        if issubclass(annotation, ComponentBase):
-            return COMPONENT_KEYS.get(component_kind(value) or "") is annotation
-        key = kind_field(annotation) or ""
-        return value.get(key) in get_args(annotation.model_fields[key].annotation)
+        if keys := telling_keys(annotation):
+            return keys.get(telling_key(dict(value), keys) or "") is annotation
+        key = kind_field(annotation)
+        return key is None or value.get(key) in get_args(annotation.model_fields[key].annotation)
     if get_origin(annotation) is dict:
         return isinstance(value, Mapping)
     if get_origin(annotation) in (list, tuple):

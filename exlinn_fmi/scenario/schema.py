@@ -6,6 +6,7 @@ setting is written down once. The JSON Schema that editors use is generated from
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
@@ -30,6 +31,7 @@ def form(value: Any) -> str:
         list: "a list",
         tuple: "a list",
         dict: "a mapping",
+        Spec: "a mapping",
     }
     return next((name for kind, name in names.items() if isinstance(value, kind)), "nothing")
 
@@ -283,7 +285,7 @@ class NmpcComponent(ComponentBase):
     nmpc: Nmpc = Field(description="the controller's settings")
 
 
-COMPONENT_KEYS = {
+COMPONENT_KEYS: Mapping[str, type[Spec]] = {
     "fmu": FmuComponent,
     "plant": PlantComponent,
     "python": PythonComponentSpec,
@@ -294,10 +296,15 @@ COMPONENT_KEYS = {
 """The key that tells what a component is, and the section it makes."""
 
 
+def telling_key(value: Any, keys: Iterable[str]) -> str | None:
+    """Which of several keys, one of which tells what a section is, a section has."""
+    found = value if isinstance(value, dict) else getattr(value, "model_fields_set", ())
+    return next((key for key in keys if key in found), None)
+
+
 def component_kind(value: Any) -> str | None:
     """Which key of `COMPONENT_KEYS` a component has."""
-    keys = value if isinstance(value, dict) else getattr(value, "model_fields_set", ())
-    return next((key for key in COMPONENT_KEYS if key in keys), None)
+    return telling_key(value, COMPONENT_KEYS)
 
 
 ComponentSpec = Annotated[
@@ -314,7 +321,7 @@ ComponentSpec = Annotated[
 
 
 class CoordinateSpec(Spec):
-    """A generalised coordinate of the model to learn, and the plant variables that carry it."""
+    """A generalised coordinate of the model to learn."""
 
     name: Name = Field(description="name of q")
     unit: str = Field(description="unit of q, e.g. rad")
@@ -323,6 +330,13 @@ class CoordinateSpec(Spec):
         "line",
         description="line; circle (an angle: the model is periodic in it); cyclic (a charge: no influence)",
     )
+    velocity_unit: str = Field("", description="unit of q̇; <unit>/s if not given")
+    input_unit: str = Field("", description="unit of the input")
+
+
+class PlantCoordinate(CoordinateSpec):
+    """A generalised coordinate of the model to learn, and the plant variables that carry it."""
+
     position: VariablePath | None = Field(
         None, description="plant variable that is q; not needed where cyclic"
     )
@@ -331,8 +345,6 @@ class CoordinateSpec(Spec):
         None, description="plant variable that is q̈; estimated from the velocity if not given"
     )
     input: VariablePath | None = Field(None, description="plant input that acts on q; none if not given")
-    velocity_unit: str = Field("", description="unit of q̇; <unit>/s if not given")
-    input_unit: str = Field("", description="unit of the input")
 
     def coordinate(self) -> Coordinate:
         """The coordinate with the names of its plant variables, less the component's name."""
@@ -353,6 +365,18 @@ class CoordinateSpec(Spec):
         )
 
 
+class DataCoordinate(CoordinateSpec):
+    """A generalised coordinate of the model to learn from data; `data.columns` tells its columns."""
+
+    velocity: Name | None = Field(None, description="name of q̇; <name>_dot if not given")
+    acceleration: Name | None = Field(None, description="name of q̈; <velocity>_dot if not given")
+    input: Name | None = Field(None, description="name of the input that acts on q; none if not given")
+
+    def coordinate(self) -> Coordinate:
+        """The coordinate by the names of its quantities."""
+        return Coordinate(**self.model_dump(exclude_none=True))
+
+
 class Experiment(Spec):
     """One run of the plant under given inputs."""
 
@@ -360,6 +384,69 @@ class Experiment(Spec):
     step: Positive = Field(1e-3, description="sampling step [s]")
     inputs: dict[VariablePath, Signal] = Field(description="signal for each driven plant input")
     start: dict[str, StartValue] = Field(default_factory=dict, description="start values of plant variables")
+
+
+class Column(Spec):
+    """A column of the data files: scale · number + offset, in `unit`."""
+
+    column: str = Field(description="name of the column in the files")
+    scale: float = Field(1.0, description="factor; -1 where the sensor counts the other way")
+    offset: float = Field(0.0, description="added after scaling")
+    unit: str | None = Field(
+        None, description="unit after that, e.g. deg; converted to the model's, which it is if not given"
+    )
+
+
+ColumnName = Annotated[Annotated[str, Tag("text")] | Annotated[Column, Tag("a mapping")], Discriminator(form)]
+
+
+class Resample(Spec):
+    """How measured data get to a regular grid."""
+
+    step: Positive = Field(description="step of the grid [s]; where coarser than the data they are smoothed")
+    interpolation: Literal["cubic", "linear"] = Field(
+        "cubic", description="how positions, velocities and accelerations go between rows"
+    )
+    inputs: Literal["linear", "hold"] = Field(
+        "linear", description="how inputs do; `hold` where a digital controller set and logged them"
+    )
+
+
+class LowPass(Spec):
+    """Zero-phase Butterworth filter, forwards and backwards over all columns."""
+
+    type: Literal["low-pass"]
+    cutoff: Positive = Field(description="frequency where the gain is one half [Hz]")
+    order: int = Field(4, ge=1, le=12, description="order, before it is run twice")
+
+
+class Measured(Spec):
+    """Measured data: CSV or Parquet files, each the recording of one run."""
+
+    files: list[str] = Field(min_length=1, description="files, relative to the scenario")
+    test: list[str] = Field(default_factory=list, description="files that training never sees")
+    hold_out: int = Field(
+        0, ge=0, description="instead of `test`: this many of `files`, drawn by seed, are kept for the test"
+    )
+    time: ColumnName | None = Field(None, description="column of the time [s]; `time` if not given")
+    step: Positive | None = Field(None, description="instead of `time`: step from row to row [s]")
+    columns: dict[Name, ColumnName] = Field(
+        default_factory=dict,
+        description="column by name of the quantity in the model; the same name where not given",
+    )
+    resample: (
+        Annotated[
+            Annotated[Positive, Tag("a number")] | Annotated[Resample, Tag("a mapping")], Discriminator(form)
+        ]
+        | None
+    ) = Field(None, description="to a regular grid of this step [s]; left as it is if not given")
+    filter: LowPass | None = Field(None, description="take out noise above the frequencies that matter")
+    delimiter: str | None = Field(
+        None, description="between the cells of CSV files, e.g. ';'; found out if not given"
+    )
+    decimal: Literal[".", ","] | None = Field(
+        None, description="decimal mark of CSV files; found out if not given"
+    )
 
 
 class Structured(Spec):
@@ -406,14 +493,10 @@ class Identify(Spec):
 
 
 class Learn(Spec):
-    """Collect data from a plant and train an extended Lagrangian model on it."""
+    """What the learning of a model takes, wherever the data come from."""
 
-    plant: Name = Field(description="component to learn")
-    coordinates: list[CoordinateSpec] = Field(min_length=1, description="the generalised coordinates")
-    training: list[Experiment] = Field(min_length=1, description="experiments to train on")
-    test: list[Experiment] = Field(default_factory=list, description="experiments that training never sees")
     train_fraction: float = Field(
-        0.8, gt=0, lt=1, description="share of the training experiments to fit; the rest validates"
+        0.8, gt=0, lt=1, description="share of the training data to fit; the rest validates"
     )
     split_blocks: int = Field(10, ge=1, description="time blocks that the split draws from")
     method: Annotated[Structured | Paper, Field(discriminator="preset")] = Field(
@@ -423,6 +506,37 @@ class Learn(Spec):
         default_factory=lambda: Identify(), description="physical parameters to read off"
     )
     seed: int | None = Field(None, ge=0, description="seed of split and weights; the scenario's if not given")
+
+
+class LearnFromPlant(Learn):
+    """Collect data from a plant and train an extended Lagrangian model on it."""
+
+    plant: Name = Field(description="component to learn")
+    coordinates: list[PlantCoordinate] = Field(min_length=1, description="the generalised coordinates")
+    training: list[Experiment] = Field(min_length=1, description="experiments to train on")
+    test: list[Experiment] = Field(default_factory=list, description="experiments that training never sees")
+
+
+class LearnFromData(Learn):
+    """Train an extended Lagrangian model on measured data."""
+
+    data: Measured = Field(description="files, and which of their columns is what")
+    coordinates: list[DataCoordinate] = Field(min_length=1, description="the generalised coordinates")
+
+
+LEARN_KEYS: Mapping[str, type[Spec]] = {"plant": LearnFromPlant, "data": LearnFromData}
+"""The key that tells what is learned from, and the section it makes."""
+
+
+def learn_kind(value: Any) -> str | None:
+    """Which key of `LEARN_KEYS` a `learn` section has."""
+    return telling_key(value, LEARN_KEYS)
+
+
+AnyLearn = Annotated[
+    Annotated[LearnFromPlant, Tag("plant")] | Annotated[LearnFromData, Tag("data")],
+    Discriminator(learn_kind),
+]
 
 
 # ── the scenario ─────────────────────────────────────────────────────────────────────────────────────────
@@ -463,11 +577,13 @@ class Scenario(Spec):
     )
     description: str = Field("", description="what it shows")
     seed: int = Field(0, ge=0, description="seed of everything random")
-    components: dict[Name, ComponentSpec] = Field(min_length=1, description="what takes part, by name")
+    components: dict[Name, ComponentSpec] = Field(
+        default_factory=dict, description="what takes part, by name"
+    )
     connections: dict[VariablePath, Targets] = Field(
         default_factory=dict, description="from: to, or from: [to, to], each component.variable"
     )
-    learn: Learn | None = Field(None, description="learn a model of one component")
+    learn: AnyLearn | None = Field(None, description="learn a model of one component, or of measured data")
     simulate: Simulate | None = Field(None, description="run the components together")
     metrics: Metrics = Field(default_factory=lambda: Metrics(), description="how the closed loop is judged")
 

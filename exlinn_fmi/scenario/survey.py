@@ -14,10 +14,12 @@ from exlinn_fmi.scenario.derived import derived_variables
 from exlinn_fmi.scenario.explain import Finding, Sound, sound_part
 from exlinn_fmi.scenario.schema import (
     ComponentBase,
-    CoordinateSpec,
     FmuComponent,
+    LearnFromData,
+    LearnFromPlant,
     ModelComponent,
     NmpcComponent,
+    PlantCoordinate,
     PythonComponentSpec,
     Scenario,
     SignalComponent,
@@ -121,6 +123,21 @@ def _coordinates(sound: Sound, variables: Mapping[str, Sequence[Variable]]) -> t
     learn = sound.scenario.learn
     if learn is None or any(path[:2] == ("learn", "coordinates") for path in sound.cut):
         return ()
+    if isinstance(learn, LearnFromData):
+        coordinates = tuple(spec.coordinate() for spec in learn.coordinates)
+    else:
+        coordinates = _plant_coordinates(learn, variables)
+    try:
+        check_coordinates(coordinates)
+    except ModelError:
+        return ()
+    return coordinates
+
+
+def _plant_coordinates(
+    learn: LearnFromPlant, variables: Mapping[str, Sequence[Variable]]
+) -> tuple[Coordinate, ...]:
+    """Coordinates of a plant in its units; none where one of its variables is not what it should be."""
     plant = {f"{learn.plant}.{v.name}": v for v in variables.get(learn.plant, ())}
     if not all(_is_sound(spec, plant) for spec in learn.coordinates):
         return ()
@@ -129,7 +146,7 @@ def _coordinates(sound: Sound, variables: Mapping[str, Sequence[Variable]]) -> t
         variable = plant.get(f"{learn.plant}.{name}")
         return stated if variable is None or variable.unit is None else variable.unit
 
-    coordinates = tuple(
+    return tuple(
         replace(
             c,
             unit=unit(c.name, c.unit),
@@ -138,14 +155,9 @@ def _coordinates(sound: Sound, variables: Mapping[str, Sequence[Variable]]) -> t
         )
         for c in (spec.coordinate() for spec in learn.coordinates)
     )
-    try:
-        check_coordinates(coordinates)
-    except ModelError:
-        return ()
-    return coordinates
 
 
-def _is_sound(spec: CoordinateSpec, plant: Mapping[str, Variable]) -> bool:
+def _is_sound(spec: PlantCoordinate, plant: Mapping[str, Variable]) -> bool:
     """Whether the variables of a coordinate are there and can be what they are said to be."""
     if spec.position is None and spec.topology != "cyclic":
         return False

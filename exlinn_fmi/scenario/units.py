@@ -1,11 +1,27 @@
-"""Whether two units written as text mean the same."""
+"""Units written as text: whether two mean the same, and how to get from one to the other."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 
 _SPELLING = str.maketrans({"·": ".", "*": ".", " ": "", "^": "", "²": "2", "³": "3", "Ω": "Ohm"})
+
+_BASES = {*"msAVNCWJHFTKg", "rad", "Hz", "Ohm", "Wb", "Pa", "kg"}
+_PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
+_SCALED = {
+    "deg": (math.pi / 180, "rad"),
+    "°": (math.pi / 180, "rad"),
+    "rev": (2 * math.pi, "rad"),
+    "rpm": (2 * math.pi / 60, "rad/s"),
+    "min": (60.0, "s"),
+    "h": (3600.0, "s"),
+    "g": (1e-3, "kg"),
+    "Nm": (1.0, "N.m"),
+    "%": (1e-2, ""),
+}
+"""Units that are a multiple of another and no prefix of it."""
 
 
 def same_unit(one: str | None, other: str | None) -> bool:
@@ -29,3 +45,41 @@ def _factors(unit: str) -> Counter[str] | str:
                 return text
             total[match[1] or ""] += int(match[2] or 1) * (-1 if k else 1)
     return Counter({name: power for name, power in total.items() if name and power})
+
+
+def conversion(found: str, wanted: str) -> float | None:
+    """Factor from one unit to another, None where there is none: rpm → rad/s, mA → A, but not C/s → A.
+
+    Args:
+        found: unit of a value, of SI units with or without prefix, deg, rev, rpm, min, h.
+        wanted: the unit that it should have.
+    """
+    (one, factors), (other, targets) = _scaled(found), _scaled(wanted)
+    return one / other if factors == targets else None
+
+
+def _scaled(unit: str) -> tuple[float, Counter[str] | str]:
+    """A unit as a multiple of factors without prefix."""
+    factors = _factors(unit)
+    if isinstance(factors, str):
+        return 1.0, factors
+    scale, total = 1.0, Counter[str]()
+    for symbol, power in factors.items():
+        multiple, base = _base(symbol)
+        scale *= multiple**power
+        for name, exponent in base.items():
+            total[name] += power * exponent
+    return scale, Counter({name: power for name, power in total.items() if power})
+
+
+def _base(symbol: str) -> tuple[float, Counter[str]]:
+    """A symbol as a multiple of units without prefix."""
+    if symbol in _SCALED:
+        multiple, text = _SCALED[symbol]
+        factors = _factors(text)
+        assert isinstance(factors, Counter)
+        return multiple, factors
+    if symbol not in _BASES and symbol[1:] in _BASES and symbol[0] in _PREFIXES:
+        multiple, factors = _base(symbol[1:])
+        return _PREFIXES[symbol[0]] * multiple, factors
+    return 1.0, Counter({symbol: 1})

@@ -212,7 +212,7 @@ def test_a_value_that_cannot_be_read_is_reported_once(tmp_path):
         ("", "the file is empty"),
         ("# only a comment\n", "the file is empty"),
         ("- a\n", "expected a mapping, found a list"),
-        ("name: a\ncomponents: {}\n", "expected at least 1 entry, found an empty mapping"),
+        ("name: a\ncomponents: {}\n", "missing key 'components': what takes part, by name"),
         ("name: a\n", "missing key 'components': what takes part, by name"),
     ],
 )
