@@ -141,9 +141,11 @@ class Run:
 
     def unchanged(self, stage: str, key: str, detail: str) -> bool:
         """Whether a stage need not run again; if it must, say so and lay the run folder."""
+        if stage in self.history:
+            return True  # done or found unchanged a moment ago
         if self.stages.holds(stage, key):
             self.reporter.stage(stage, "unchanged since the last run")
-            self._note(stage, "cached", None)
+            self.noted(stage, "cached", None)
             return True
         self.reporter.stage(stage, detail)
         self.stages.forget(stage)
@@ -154,14 +156,14 @@ class Run:
         """Record that a stage is done."""
         seconds = time.perf_counter() - began
         self.stages.record(stage, key, written, seconds)
-        self._note(stage, "ran", seconds)
+        self.noted(stage, "ran", seconds)
 
     def failed(self, stage: str, error: ExlinnError) -> ExlinnError:
         """Record that a stage failed and why; gives the error back, to be raised."""
-        self._note(stage, "failed", None, error=str(error))
+        self.noted(stage, "failed", None, error=str(error))
         return error
 
-    def _note(self, stage: str, status: str, seconds: float | None, **more: Any) -> None:
+    def noted(self, stage: str, status: str, seconds: float | None, **more: Any) -> None:
         """Keep ``provenance.json`` up to date: where all that is in the folder came from."""
         from exlinn_fmi.results.tables import provenance, write_provenance
 
@@ -280,8 +282,9 @@ def train(work: Run) -> None:
     write_text(parameters, card.parameters.to_csv(index=False))
     work.replace_metrics(("learn.", "identify."), card.metrics)
     if work.stop.take():
-        # The stage is not recorded: the next run trains again.
+        # The stage is not recorded as done: the next run trains again.
         work.warn("training was stopped: the best weights so far are used; the next run trains to the end")
+        work.noted("train", "interrupted", None)
     else:
         work.done("train", key, [*written, parameters], began)
 

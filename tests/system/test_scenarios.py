@@ -11,7 +11,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from exlinn_fmi import Run
+from exlinn_fmi import run as pipeline_run
 from exlinn_fmi.cli import exit_code
+from exlinn_fmi.pipeline import Silent
 from tests.fmu_helpers import description_2, other_fmus, probe
 
 
@@ -107,7 +110,10 @@ def test_run_without_training_loads_no_torch(tracking: Path, root: Path, tmp_pat
 
     code = f"""
 import sys
+from exlinn_fmi import Run
+from exlinn_fmi import run as pipeline_run
 from exlinn_fmi.cli import exit_code
+from exlinn_fmi.pipeline import Silent
 assert exit_code(["simulate", {str(root / "scenarios/dcwc_tracking.yaml")!r}, "--out", {str(tracking)!r},
                   "--set", "simulate.stop=0.5"]) == 0
 assert "torch" not in sys.modules
@@ -222,3 +228,31 @@ def test_exporting_a_folder_without_a_model_exits_with_1(
 ) -> None:
     assert exit_code(["export", "model", str(tmp_path)]) == 1
     assert "model.json" in capsys.readouterr().err
+
+
+def test_stopped_training_keeps_the_best_so_far_and_the_next_run_trains_again(
+    root: Path, tmp_path: Path
+) -> None:
+    work = Run.open(root / "scenarios/dcwc_tracking.yaml", tmp_path, ["simulate.stop=0.1"])
+    trained: list[str] = []
+
+    class Impatient(Silent):
+        """Asks to stop as soon as training shows progress."""
+
+        def update(self, fraction: float, text: str = "") -> None:
+            if text.startswith("loss"):
+                work.stop.requested = True
+
+        def stage(self, name: str, detail: str) -> None:
+            trained.append(f"{name} {detail}")
+
+    work.reporter = Impatient()
+    pipeline_run(work)
+    assert [text for text in trained if text.startswith("train")] == ["train preset structured"]
+    assert (
+        json.loads((tmp_path / "provenance.json").read_text())["stages"]["train"]["status"] == "interrupted"
+    )
+    assert json.loads((tmp_path / "metrics.json").read_text())["simulate.steps"] == 100
+    again = Run.open(root / "scenarios/dcwc_tracking.yaml", tmp_path, ["simulate.stop=0.1"])
+    assert again.stages.key("collect") is not None
+    assert again.stages.key("train") is None
