@@ -11,8 +11,8 @@ quantities are dimensionless (`Scales`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -27,31 +27,37 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Assembly:
-    """Coefficients at B samples: r = weight (value · f + gradient · ∂f/∂z + (K − Kᵀ)q̇ + ∂D/∂q̇ − target).
+    """Coefficients at B samples: r = value · f + gradient · ∂f/∂z + (K − Kᵀ)q̇ + ∂D/∂q̇ − target.
 
     Args:
         z: network inputs (B, nz).
+        basis: the direct path of the networks [1, z, products] (B, nd), and
+        slopes: its derivatives with respect to z (B, nd, nz).
         velocity: q̇ (B, n).
         value: of each function f_t in each equation (B, n, T).
         gradient: of each derivative ∂f_t/∂z_j in each equation (B, n, T, nz).
         target: F (B, n).
-        weight: of each equation (n,), so that none drowns in another.
     """
 
     z: Float[Array, "B nz"]
+    basis: Float[Array, "B nd"]
+    slopes: Float[Array, "B nd nz"]
     velocity: Float[Array, "B n"]
     value: Float[Array, "B n T"]
     gradient: Float[Array, "B n T nz"]
     target: Float[Array, "B n"]
-    weight: Float[Array, " n"]
 
     def __len__(self) -> int:
         return len(self.target)
 
     def part(self, samples: slice) -> Assembly:
         """Some of the samples."""
-        arrays = {f.name: getattr(self, f.name)[samples] for f in fields(self) if f.name != "weight"}
-        return Assembly(**arrays, weight=self.weight)
+        return Assembly(**{f.name: getattr(self, f.name)[samples] for f in fields(self)})
+
+    def inertia(self) -> Assembly:
+        """Coefficients of the inertial forces M q̈ alone."""
+        none = {name: np.zeros_like(getattr(self, name)) for name in ("velocity", "gradient", "target")}
+        return replace(self, **none)
 
     def chunks(self, size: int) -> Iterator[Assembly]:
         """Parts of at most `size` samples, so that a Jacobian fits into the cache."""
@@ -83,20 +89,19 @@ def data_scales(samples: Samples, coordinates: tuple[Coordinate, ...]) -> Scales
     )
 
 
-def inverse_assembly(spec: ModelSpec, samples: Samples, weight: Float[Array, " n"] | None = None) -> Assembly:
+def inverse_assembly(spec: ModelSpec, samples: Samples) -> Assembly:
     """Coefficients of the inverse model (17), the paper's residual: one row for each sample and equation.
 
     Args:
         spec: a structured model.
         samples: the data, in the user's units.
-        weight: of each equation; 1 if not given.
     """
     assert spec.scales is not None
     position, speed = np.array(spec.scales.position), spec.scales.velocity
     w, a = samples.v / speed, samples.a * spec.scales.time / speed
-    z, slope = topology_features(spec, samples.q)
+    z, rate = topology_features(spec, samples.q)
     owners = spec.layout.owners
-    slope = slope * position[owners]  # ∂z/∂q̂
+    slope = rate * position[owners]  # ∂z/∂q̂
     (rows, n), count, nz = w.shape, len(spec.layout.terms), len(owners)
     value, gradient = np.zeros((rows, n, count)), np.zeros((rows, n, count, nz))
     rate = slope * w[:, owners]  # ż
@@ -106,8 +111,24 @@ def inverse_assembly(spec: ModelSpec, samples: Samples, weight: Float[Array, " n
         gradient[:, :, t] = first[:, :, None] * rate[:, None]
         for j, k in enumerate(owners):
             gradient[:, k, t, j] -= monomial * slope[:, j]
-    target = samples.F / spec.scales.force
-    return Assembly(z, w, value, gradient, target, np.ones(n) if weight is None else weight)
+    basis, slopes = product_basis(z, spec.layout.products)
+    return Assembly(z, basis, slopes, w, value, gradient, samples.F / spec.scales.force)
+
+
+def product_basis(
+    z: Float[Array, "B nz"], products: Sequence[tuple[int, ...]]
+) -> tuple[Float[Array, "B H"], Float[Array, "B H nz"]]:
+    """[1, z, products of features] and their derivatives with respect to z."""
+    rows, nz = z.shape
+    basis = np.ones((rows, 1 + nz + len(products)))
+    slopes = np.zeros((*basis.shape, nz))
+    basis[:, 1 : 1 + nz] = z
+    slopes[:, 1 : 1 + nz] = np.eye(nz)
+    for k, product in enumerate(products, start=1 + nz):
+        basis[:, k] = z[:, product].prod(axis=1)
+        for place, i in enumerate(product):
+            slopes[:, k, i] += z[:, product[:place] + product[place + 1 :]].prod(axis=1)
+    return basis, slopes
 
 
 def _velocity_monomial(

@@ -1,15 +1,13 @@
 """The structured networks in numpy: residual of the inverse model and its Jacobian, by hand.
 
 The residual is linear in values and derivatives of the functions of position (`assembly.py`), those are
-products of network outputs, and the outputs are linear in the basis [1, z, zz, tanh(Wz + b)]: four short
-chain rules.
-Shapes: B samples, n equations, T functions f, O outputs, H basis functions, nz network inputs, h hidden
-    units.
+products of network outputs, and the outputs are linear in the basis [1, z, products, tanh(Wz + b)]: four
+short chain rules. Shapes: B samples, n equations, T functions f, O outputs, H basis functions, nz network
+inputs, h hidden units.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -45,6 +43,16 @@ class StructuredNetworks:
         """Which of all weights, one after the other, are in θ."""
         return np.concatenate([mask.ravel() for mask in self.spec.layout.free.values()])
 
+    @cached_property
+    def _places(self) -> dict[str, tuple[slice, tuple[int, ...]]]:
+        """Where each array lies among all weights, and its shape."""
+        places, start = {}, 0
+        for name, shape in self.spec.layout.shapes.items():
+            stop = start + int(np.prod(shape))
+            places[name] = (slice(start, stop), shape)
+            start = stop
+        return places
+
     @property
     def size(self) -> int:
         """Number of free weights."""
@@ -54,12 +62,7 @@ class StructuredNetworks:
         """Weight arrays by name."""
         full = np.zeros(self._free.shape)
         full[self._free] = theta
-        weights, start = {}, 0
-        for name, shape in self.spec.layout.shapes.items():
-            size = int(np.prod(shape))
-            weights[name] = full[start : start + size].reshape(shape)
-            start += size
-        return weights
+        return {name: full[part].reshape(shape) for name, (part, shape) in self._places.items()}
 
     def pack(self, weights: dict[str, Array]) -> Float[Array, " P"]:
         """θ of weight arrays."""
@@ -72,18 +75,11 @@ class StructuredNetworks:
     # ── values ───────────────────────────────────────────────────────────────────────────────────────────
 
     def residual(self, theta: Float[Array, " P"], data: Assembly) -> Float[Array, "B n"]:
-        """Equations of motion less the forces in the data, in units of `Scales.force`, weighted."""
+        """Equations of motion less the forces in the data, in units of `Scales.force`."""
         return self._forward(self.unpack(theta), data).residual
 
-    def functions(
-        self, weights: dict[str, Array], z: Float[Array, "B nz"]
-    ) -> tuple[Float[Array, "B T"], Float[Array, "B T nz"]]:
-        """The functions of position f_t and ∂f_t/∂z."""
-        basis, slopes = self._basis(weights, z)
-        return self._terms(*_outputs(weights, basis, slopes))
-
     def _forward(self, weights: dict[str, Array], data: Assembly) -> _Forward:
-        basis, slopes = self._basis(weights, data.z)
+        basis, slopes = self._basis(weights, data)
         outputs, gradients = _outputs(weights, basis, slopes)
         f, df = self._terms(outputs, gradients)
         residual = np.einsum("bnt,bt->bn", data.value, f) - data.target
@@ -92,19 +88,17 @@ class StructuredNetworks:
         residual += weights["dissipation.viscous"] ** 2 * data.velocity
         a, s = weights["dissipation.friction"], friction_width(weights)
         residual += (a**2 * s * np.tanh(data.velocity[:, :, None] / s)).sum(axis=2)
-        return _Forward(basis, slopes, outputs, gradients, residual * data.weight)
+        return _Forward(basis, slopes, outputs, gradients, residual)
 
     def _basis(
-        self, weights: dict[str, Array], z: Float[Array, "B nz"]
+        self, weights: dict[str, Array], data: Assembly
     ) -> tuple[Float[Array, "B H"], Float[Array, "B H nz"]]:
-        """[1, z, zz of lines, tanh(Wz + b)] and derivatives."""
-        layout = self.spec.layout
-        basis, slopes = product_basis(z, layout.products)
+        """[1, z, products, tanh(Wz + b)] and derivatives."""
         w = weights["lagrangian.hidden.weight"]
-        hidden = np.tanh(z @ w.T + weights["lagrangian.hidden.bias"])
+        hidden = np.tanh(data.z @ w.T + weights["lagrangian.hidden.bias"])
         return (
-            np.concatenate([basis, hidden], axis=1),
-            np.concatenate([slopes, (1 - hidden**2)[:, :, None] * w], axis=1),
+            np.concatenate([data.basis, hidden], axis=1),
+            np.concatenate([data.slopes, (1 - hidden**2)[:, :, None] * w], axis=1),
         )
 
     def _terms(
@@ -141,7 +135,7 @@ class StructuredNetworks:
         parts = [*self._hidden_columns(weights, forward, data, value, gradient)]
         parts.append(output.reshape(rows, n, count * layout.basis))
         parts += [coupling_columns(layout, data.velocity), *_dissipation_columns(weights, data)]
-        return forward.residual, np.concatenate(parts, axis=2)[:, :, self._free] * data.weight[:, None]
+        return forward.residual, np.concatenate(parts, axis=2)[:, :, self._free]
 
     def _output_coefficients(
         self, forward: _Forward, data: Assembly
@@ -183,20 +177,6 @@ class StructuredNetworks:
         bias -= np.einsum("bnhz,hz->bnh", by_slope, w) * (2 * tanh * first)[:, None]
         weight = bias[..., None] * data.z[:, None, None] + by_slope * first[:, None, :, None]
         return weight.reshape(rows, n, h * nz), bias
-
-
-def product_basis(
-    z: Float[Array, "B nz"], pairs: Sequence[tuple[int, int]]
-) -> tuple[Float[Array, "B H"], Float[Array, "B H nz"]]:
-    """[1, z, z_i z_j of the pairs] and their derivatives with respect to z."""
-    rows, nz = z.shape
-    basis = np.concatenate([np.ones((rows, 1)), z, *(z[:, [i]] * z[:, [j]] for i, j in pairs)], axis=1)
-    slopes = np.zeros((*basis.shape, nz))
-    slopes[:, 1 : 1 + nz] = np.eye(nz)
-    for k, (i, j) in enumerate(pairs, start=1 + nz):
-        slopes[:, k, i] += z[:, j]
-        slopes[:, k, j] += z[:, i]
-    return basis, slopes
 
 
 def coupling_columns(layout: Layout, velocity: Float[Array, "B n"]) -> Float[Array, "B n C"]:

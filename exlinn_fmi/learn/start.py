@@ -3,7 +3,8 @@
 With the functions of position on a low-order basis ([1, z, zz] for M, the networks' direct path for A and
 V) and viscous D the residual is linear in all unknowns: one solve gives M, coupling, potentials and
 friction at once. A row without input is homogeneous, so that noise or too poor a basis can shrink it until
-M is not positive definite; then the start is a plain diagonal M instead.
+M is not positive definite; then the start is a plain diagonal M instead. Such rows weigh no more than their
+power: a larger weight would shrink them further.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from exlinn_fmi.learn.assembly import Assembly
-from exlinn_fmi.learn.networks import coupling_columns, product_basis
+from exlinn_fmi.learn.assembly import Assembly, product_basis
+from exlinn_fmi.learn.networks import coupling_columns
 from exlinn_fmi.mechanics.learned import Layout
 
 Array = NDArray[np.float64]
@@ -40,11 +41,10 @@ SPREAD = 0.1
 
 
 class Start(NamedTuple):
-    """First weights by name, ε for each coordinate, and the size of each equation's forces, shape (n,)."""
+    """First weights by name, and ε for each coordinate."""
 
     weights: dict[str, Array]
     epsilon: tuple[float, ...]
-    forces: Float[Array, " n"]
 
 
 class _Solution(NamedTuple):
@@ -62,14 +62,11 @@ def linear_start(layout: Layout, data: Assembly, seed: int) -> Start:
 
     Args:
         layout: of the networks.
-        data: coefficients of the inverse model, with weights 1.
+        data: coefficients of the inverse model.
         seed: of all that is drawn.
     """
     part = data.part(slice(None, None, -(-len(data) // SAMPLES)))
-    # An equation without input has a size of its own, which only the solution shows: weight by it and solve
-    # again.
-    first = _solve(layout, part, part.weight)
-    found = _solve(layout, part, 1 / first.forces)
+    found = _solve(layout, part)
     random = np.random.default_rng(seed)
     weights = {name: np.zeros(shape) for name, shape in layout.shapes.items()}
     epsilon = np.zeros(len(found.forces))
@@ -94,22 +91,25 @@ def linear_start(layout: Layout, data: Assembly, seed: int) -> Start:
     slope = weights["lagrangian.hidden.weight"]
     slope[:] = 1.5 * random.standard_normal(slope.shape)
     weights["lagrangian.hidden.bias"][:] = -(slope * random.uniform(-1, 1, slope.shape)).sum(axis=1)
-    return Start(weights, tuple(epsilon.tolist()), found.forces)
+    return Start(weights, tuple(epsilon.tolist()))
 
 
-def _solve(layout: Layout, part: Assembly, weight: Float[Array, " n"]) -> _Solution:
+def _solve(layout: Layout, part: Assembly) -> _Solution:
     """Weighted linear least squares for everything at once."""
     n = part.velocity.shape[1]
     pairs = list(combinations_with_replacement(range(part.z.shape[1]), 2))
     bases, columns = [], []
     for t, (kind, _, _) in enumerate(layout.terms):
-        basis, slopes = product_basis(part.z, pairs if kind == "M" else layout.products)
-        if kind != "M":  # constants have no effect there
-            basis, slopes = basis[:, 1:], slopes[:, 1:]
+        if kind == "M":
+            basis, slopes = product_basis(part.z, pairs)
+        else:  # constants have no effect there
+            basis, slopes = part.basis[:, 1:], part.slopes[:, 1:]
         column = part.value[:, :, t, None] * basis[:, None]
         columns.append(column + np.einsum("bnz,bhz->bnh", part.gradient[:, :, t], slopes))
         bases.append(basis)
     columns += [coupling_columns(layout, part.velocity), part.velocity[:, :, None] * np.eye(n)]
+    size = np.sqrt(np.mean(part.target**2, axis=0))
+    weight = 1 / np.where(size > 0, size, 1)
     matrix = (np.concatenate(columns, axis=2) * weight[:, None]).reshape(part.target.size, -1)
     size = np.linalg.norm(matrix, axis=0)
     size[size == 0] = 1

@@ -15,10 +15,11 @@ Networks see dimensionless quantities only: `Scales` carries the units, so that 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from itertools import combinations_with_replacement
+from itertools import combinations_with_replacement, pairwise
 from typing import Any, Literal
 
 import casadi as ca
@@ -160,7 +161,7 @@ class Layout:
     Attributes:
         positions: coordinates that are not cyclic.
         owners: for each feature z the coordinate that it comes from.
-        products: pairs of features that are multiplied: of two coordinates, or a line's with itself.
+        products: two or three features that are multiplied: of different coordinates, or of a line.
         blocks: members of each diagonal block of M.
         columns: number of columns of L in each block.
         terms: the functions of q in 𝓛: ("M", i, j), ("A", i, i) and ("V", 0, 0).
@@ -176,9 +177,13 @@ class Layout:
         self.positions = [i for i in range(n) if topologies[i] != "cyclic"]
         self.owners = [i for i in self.positions for _ in range(2 if topologies[i] == "circle" else 1)]
         self.products = [
-            (a, b)
-            for a, b in combinations_with_replacement(range(len(self.owners)), 2)
-            if self.owners[a] != self.owners[b] or topologies[self.owners[a]] == "line"
+            product
+            for degree in (2, 3)
+            for product in combinations_with_replacement(range(len(self.owners)), degree)
+            if all(
+                self.owners[a] != self.owners[b] or topologies[self.owners[a]] == "line"
+                for a, b in pairwise(product)
+            )
         ]
         blocks = [[i for i in range(n) if kinds[i] == kind] for kind in ("mechanical", "electrical")]
         self.blocks = [block for block in blocks if block]
@@ -316,7 +321,7 @@ def _structured_lagrangian(spec: ModelSpec, weights: Weights, q: Symbol, v: Symb
     layout, scales = spec.layout, spec.scales
     z = topology_features(spec, q)
     x, w = q / ca.DM(scales.position), v / ca.DM(scales.velocity)
-    products = [z[a] * z[b] for a, b in layout.products]
+    products = [math.prod(z[a] for a in product) for product in layout.products]
     hidden = ca.tanh(
         ca.mtimes(ca.DM(weights["lagrangian.hidden.weight"]), z) + ca.DM(weights["lagrangian.hidden.bias"])
     )
