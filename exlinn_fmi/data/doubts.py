@@ -174,7 +174,7 @@ def plateaus(values: Signal) -> list[Plateau]:
 
     A plateau is a run at the extreme that the signal enters with a bend: half of its length before it began
     the signal was further away than a parabola that stays so long within the noise (or the resolution of the
-    sensor) of its vertex can be. Signals that go in steps are not judged.
+    sensor) of its vertex can be. One that is entered by a jump belongs to a signal that goes in steps.
     """
     moves = np.abs(np.diff(values))
     real = moves[moves > 1e-9 * np.ptp(values)]
@@ -186,20 +186,28 @@ def plateaus(values: Signal) -> list[Plateau]:
     for sign in (1.0, -1.0):
         x = sign * values
         inside = x >= x.max() - noise
-        if np.mean(moves[~inside[1:]] > 0) < 0.5 or inside.all():
-            continue
         edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
         runs = [(int(a), int(b - a)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-        cut = [
-            (length, start)
-            for start, length in runs
-            if length >= LONG and start >= length // 2 and x.max() - x[start - length // 2] > 6 * thickness
-        ]
+        cut = [(length, start) for start, length in runs if length >= LONG and start > 0]
+        cut = [run for run in cut if _bends(x.max() - x, *run, 6 * thickness)]
         share = sum(length for length, _ in cut) / len(values)
         if share > SHARE:
             length, start = max(cut)
             found.append(Plateau(start, length, float(values[start]), share))
     return found
+
+
+def _bends(away: Signal, length: int, start: int, least: float) -> bool:
+    """Whether a signal comes to its extreme with a bend, neither gently nor by a jump.
+
+    Args:
+        away: distance from the extreme.
+        length: of the plateau.
+        start: its first row.
+        least: distance, half a length before, that no gentle arrival has.
+    """
+    before = float(away[max(start - length // 2, 0)])
+    return before > least and float(away[start - 1]) < before / 2
 
 
 # ── what belongs together ────────────────────────────────────────────────────────────────────────────────

@@ -197,9 +197,7 @@ def _dialect(
     _, number, mark = best
     names = split_line(lines[number - 1], mark)
     if all(map(_is_number, names)):
-        raise DataError(
-            f"{path.name}:{number}: numbers, expected the names of the columns; add a line of them"
-        )
+        raise DataError(f"{path.name}:{number}: found numbers, expected a line of column names; add one")
     rows = [split_line(line, mark) for line in lines[number:]]
     if not rows:
         raise DataError(f"{path.name}: no rows below the column names")
@@ -243,8 +241,6 @@ def _body(path: Path, text: str, dialect: Dialect) -> tuple[str, list[str]]:
     body = text.split("\n", dialect.first - 1)[-1]
     if dialect.delimiter == " ":
         body = re.sub(r"[ \t]+", " ", re.sub(r"(?m)^[ \t]+|[ \t]+$", "", body))
-    if '"' in body:
-        return body, []  # delimiters may stand within quotes: left to the parser
     expected = len(dialect.names)
     cells = _count_cells(body, dialect.delimiter, expected)
     if len(cells) > 1 and cells[-1] < expected and (cells[:-1] == expected).all():
@@ -265,8 +261,9 @@ def _body(path: Path, text: str, dialect: Dialect) -> tuple[str, list[str]]:
 def _count_cells(body: str, delimiter: str, expected: int) -> Int[NDArray[np.int64], " N"]:
     """Number of cells in each line; a delimiter at the end that closes the last cell is not counted."""
     raw = np.frombuffer(body.encode(), dtype=np.uint8)
-    ends = np.append(np.flatnonzero(raw == ord("\n")), len(raw))
-    marks = np.append(0, np.cumsum(raw == ord(delimiter)))
+    bare = np.cumsum(raw == ord('"')) % 2 == 0  # not within quotes
+    ends = np.append(np.flatnonzero((raw == ord("\n")) & bare), len(raw))
+    marks = np.append(0, np.cumsum((raw == ord(delimiter)) & bare))
     cells = np.diff(np.append(0, marks[ends])).astype(np.int64) + 1
     starts = np.append(0, ends[:-1] + 1)
     closed = (raw[np.maximum(ends - 1, 0)] == ord(delimiter)) & (cells == expected + 1)
@@ -289,7 +286,6 @@ def _cells(path: Path, body: str, dialect: Dialect, wanted: list[str]) -> pd.Dat
             skipinitialspace=True,
             skip_blank_lines=False,
             low_memory=False,
-            float_precision="round_trip",
         )
     except ValueError as error:  # pandas' parser errors are ValueErrors; they count lines from 1
         text = re.sub(r"line (\d+)", lambda m: f"line {int(m[1]) + dialect.first - 1}", _line(error))
@@ -356,12 +352,11 @@ def _as_numbers(column: pd.Series[Any]) -> Float[NDArray[np.float64], " N"]:
 
 def _shown(column: pd.Series[Any], row: int, dialect: Dialect | None, body: str) -> str:
     """What a cell holds, as it stands in the file."""
-    cell = str(column.iloc[row])
-    if dialect is not None and '"' not in body:
+    if dialect is not None:
         cells = split_line(body.split("\n", row + 1)[row], dialect.delimiter)
         cell = cells[dialect.names.index(str(column.name))]
-    elif pd.isna(column.iloc[row]):
-        cell = ""
+    else:
+        cell = "" if pd.isna(column.iloc[row]) else str(column.iloc[row])
     return repr(cell) if cell.strip() else "nothing"
 
 

@@ -229,7 +229,7 @@ def trajectories(
     uneven = bool(np.any(np.abs(within - usual) > EVEN * usual))
     grid = Resample(step=data.resample) if isinstance(data.resample, float | int) else data.resample
     if grid is None and uneven:
-        grid = Resample(step=_readable(usual))
+        grid = Resample(step=_readable(float(within.sum() / np.round(within / usual).sum())))
         notes.append(_jitter_note(recording, within, grid.step))
     if grid is not None:
         long = [resample(part, grid, inputs) for part in long]
@@ -324,7 +324,7 @@ def low_pass(frame: pd.DataFrame, options: LowPass, file: str) -> pd.DataFrame:
             f"{file}: the filter's cut-off, {options.cutoff:g} Hz, is not below half of the sampling "
             f"frequency, {0.5 / step:.4g} Hz; lower `filter.cutoff`, or leave the filter out"
         )
-    settle = int(np.ceil(0.5 / (options.cutoff * step)))
+    settle = int(np.ceil(0.5 / (options.cutoff * step) - 1e-6))
     filtered = _butterworth(frame, options.cutoff, options.order)
     return filtered.iloc[settle : len(filtered) - settle].reset_index(drop=True)
 

@@ -13,6 +13,7 @@ from exlinn_fmi.scenario.units import conversion
 from exlinn_fmi.scenario.words import KeyPath, missing_file, suggestion
 
 AT: KeyPath = ("learn", "data")
+NO_TIME = "; say which column is the time: `time: NAME`"
 
 
 def measured(survey: Survey) -> Iterator[Finding]:
@@ -20,14 +21,14 @@ def measured(survey: Survey) -> Iterator[Finding]:
     learn = survey.scenario.learn
     if not isinstance(learn, LearnFromData):
         return
-    data = learn.data
-    found = list(_files(data, survey))
+    found = [*_files(learn.data, survey), *_settings(learn.data)]
+    if survey.coordinates:
+        found += _columns(learn.data, survey.coordinates)
+        if not any(at[:2] == AT for at in survey.sound.cut) and all(
+            at[2] in ("files", "test") for at, _ in found
+        ):
+            found += _headers(learn.data, survey, {at for at, _ in found})
     yield from found
-    yield from _settings(data)
-    if not survey.coordinates:
-        return
-    yield from _columns(data, survey.coordinates)
-    yield from _headers(data, survey.coordinates, survey, {at for at, _ in found})
 
 
 def _files(data: Measured, survey: Survey) -> Iterator[Finding]:
@@ -96,30 +97,28 @@ def _conversion(at: KeyPath, column: str | Column, unit: str) -> Iterator[Findin
         yield (*at, "unit"), message
 
 
-def _headers(
-    data: Measured, coordinates: Sequence[Coordinate], survey: Survey, faulty: set[KeyPath]
-) -> Iterator[Finding]:
-    """Files that are no tables, and columns that they do not have."""
+def _headers(data: Measured, survey: Survey, faulty: set[KeyPath]) -> Iterator[Finding]:
+    """Files that are no tables, and columns that they do not have; of each the first file without it."""
     from exlinn_fmi.data.foreign import column_names, no_column
     from exlinn_fmi.data.measured import as_column, quantities
 
     clock = None if data.step is not None else as_column(data.time or "time")
-    for key in ("files", "test"):
-        for k, file in enumerate(getattr(data, key)):
-            if (*AT, key, k) in faulty:
-                continue
-            names = [as_column(c).column for c in data.columns.values()] + ([clock.column] if clock else [])
-            try:
-                known = column_names(survey.folder / file, names, data.delimiter, data.decimal)
-            except DataError as error:
-                yield (*AT, key, k), str(error)
-                continue
-            wanted = {name: column for name, (column, _) in quantities(data, coordinates, known).items()}
-            for name, column in wanted.items():
-                if column.column not in known:
-                    at = (*AT, "columns", name) if name in data.columns else (*AT, key, k)
-                    yield at, f"{file}: {name}: {no_column(column.column, known)}"
-            if clock is not None and clock.column not in known:
-                at = (*AT, "time") if data.time is not None else (*AT, key, k)
-                hint = "" if data.time is not None else "; say which column is the time: `time: NAME`"
-                yield at, f"{file}: {no_column(clock.column, known)}{hint}"
+    stated = [as_column(c).column for c in data.columns.values()] + ([clock.column] if clock else [])
+    lacking: dict[str, Finding] = {}
+    for at in ((*AT, key, k) for key in ("files", "test") for k in range(len(getattr(data, key)))):
+        if at in faulty:
+            continue
+        file = getattr(data, str(at[2]))[at[3]]
+        try:
+            known = column_names(survey.folder / file, stated, data.delimiter, data.decimal)
+        except DataError as error:
+            yield at, str(error)
+            continue
+        if clock is not None and clock.column not in known:
+            place, hint = ((*AT, "time"), "") if data.time is not None else (at, NO_TIME)
+            lacking.setdefault("", (place, f"{file}: {no_column(clock.column, known)}{hint}"))
+        for name, (column, _) in quantities(data, survey.coordinates, known).items():
+            if column.column not in known:
+                place = (*AT, "columns", name) if name in data.columns else at
+                lacking.setdefault(name, (place, f"{file}: {name}: {no_column(column.column, known)}"))
+    yield from lacking.values()

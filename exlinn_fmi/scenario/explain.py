@@ -69,13 +69,22 @@ def schema_findings(data: Any, known: frozenset[KeyPath] = frozenset()) -> list[
         data: the scenario as plain data.
         known: places that were reported before, which are not reported again.
     """
+    errors = [(error, locate(error["loc"], data)) for error in _errors(Scenario, data)]
+    # Of a section that says of itself that it is two things, no more is said: it depends on which it is.
+    torn = {place.path[:-1]: place.path for error, place in errors if _is_torn(error, place)}
     findings = []
-    for error in _errors(Scenario, data):
-        place = locate(error["loc"], data)
+    for error, place in errors:
         finding = _explain(error, place)
-        if finding is not None and place.path not in known:
+        around = (place.path[:k] for k in range(len(place.path)))
+        moot = any(torn.get(section, place.path) != place.path for section in around)
+        if finding is not None and place.path not in known and not moot:
             findings.append(finding)
     return list(dict.fromkeys(findings))
+
+
+def _is_torn(error: ErrorDetails, place: Place) -> bool:
+    """Whether a section has a second key of those one of which tells what it is."""
+    return error["type"] == "extra_forbidden" and place.path[-1] in telling_keys(place.model)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ _SCALED = {
     "h": (3600.0, "s"),
     "g": (1e-3, "kg"),
     "Nm": (1.0, "N.m"),
-    "%": (1e-2, ""),
 }
 """Units that are a multiple of another and no prefix of it."""
 
@@ -76,9 +75,7 @@ def _base(symbol: str) -> tuple[float, Counter[str]]:
     """A symbol as a multiple of units without prefix."""
     if symbol in _SCALED:
         multiple, text = _SCALED[symbol]
-        factors = _factors(text)
-        assert isinstance(factors, Counter)
-        return multiple, factors
+        return multiple, Counter(_factors(text))
     if symbol not in _BASES and symbol[1:] in _BASES and symbol[0] in _PREFIXES:
         multiple, factors = _base(symbol[1:])
         return _PREFIXES[symbol[0]] * multiple, factors
