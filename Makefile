@@ -25,7 +25,7 @@ check: .venv/.dev .coverage
 	$(BIN)/lint-imports
 	$(BIN)/coverage report --fail-under=95 --skip-covered
 
-bench: .venv/.dev
+bench: .venv/.bench
 	for file in benchmarks/*.py; do echo "== $$file" && $(BIN)/python $$file || exit 1; done
 
 .coverage:
@@ -39,6 +39,10 @@ bench: .venv/.dev
 
 .venv/.dev: .venv/.user
 	$(INSTALL) -e '.[dev]'
+	touch $@
+
+.venv/.bench: .venv/.dev
+	$(INSTALL) -e '.[bench]'
 	touch $@
 
 clean:
