@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from exlinn_fmi.mechanics.coordinates import Coordinate, Parameter
     from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
     from exlinn_fmi.mechanics.plant import Energies, Output, Plant
-    from exlinn_fmi.pipeline import Run, collect, report, run, simulate, train
+    from exlinn_fmi.pipeline import collect, report, run, simulate, train
+    from exlinn_fmi.workspace import Run
 
 _HOME = {
     "Component": "components.base",
@@ -32,7 +33,7 @@ _HOME = {
     "Parameter": "mechanics.coordinates",
     "Plant": "mechanics.plant",
     "PythonComponent": "components.python",
-    "Run": "pipeline",
+    "Run": "workspace",
     "RunError": "errors",
     "ScenarioError": "errors",
     "Status": "components.base",

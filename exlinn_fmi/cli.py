@@ -14,7 +14,7 @@ import typer
 from exlinn_fmi.errors import ExlinnError, InputError, Interrupted, StorageError
 
 if TYPE_CHECKING:
-    from exlinn_fmi.pipeline import Run
+    from exlinn_fmi.workspace import Run
 
 # Typer brings its own copy of click from 0.26 on: the base of its usage errors is found either way.
 UsageError: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
@@ -78,7 +78,7 @@ class Terminal:
 
 def perform(work: Callable[[Run], object], file: Path, out: Path | None, overrides: list[str] | None) -> Run:
     """Do some work on a scenario, with progress shown and Ctrl-C minded."""
-    from exlinn_fmi.pipeline import Run
+    from exlinn_fmi.workspace import Run
 
     terminal = Terminal()
     try:
@@ -113,7 +113,7 @@ def validate(scenario: ScenarioFile, overrides: Overrides = None) -> None:
 
     Example: exlinn validate scenarios/dcwc_paper.yaml
     """
-    from exlinn_fmi.pipeline import Run
+    from exlinn_fmi.workspace import Run
 
     work = Run.open(scenario, None, overrides or ())
     parts = f"{len(work.scenario.components)} components, {len(work.scenario.connection_list())} connections"
@@ -263,7 +263,7 @@ def schema(
 
 def show_metrics(folder: Path, *prefixes: str) -> None:
     """Print the metrics of a run folder, one a line."""
-    from exlinn_fmi.pipeline import metrics
+    from exlinn_fmi.workspace import metrics
 
     values = {k: v for k, v in metrics(folder).items() if k.startswith(prefixes or ("",))}
     width = max(map(len, values), default=0)

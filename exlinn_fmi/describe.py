@@ -51,8 +51,8 @@ def describe_scenario(file: Path, overrides: Sequence[str]) -> str:
     """
     from exlinn_fmi.cosim.graph import Graph
     from exlinn_fmi.factory import outline
-    from exlinn_fmi.pipeline import Run
     from exlinn_fmi.scenario.schema import LearnFromData
+    from exlinn_fmi.workspace import Run
 
     work = Run.open(file, None, overrides)
     components = {name: outline(name, work.scenario, work.loaded.folder) for name in work.scenario.components}

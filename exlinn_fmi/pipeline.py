@@ -7,186 +7,34 @@ Every stage leaves its files in the run folder and is skipped when nothing that 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-from exlinn_fmi.components.base import Component
-from exlinn_fmi.data.files import read_json, write_json, write_table, write_text
-from exlinn_fmi.errors import ExlinnError, InputError
-from exlinn_fmi.factory import build, inspect
-from exlinn_fmi.interrupts import StopRequest
-from exlinn_fmi.scenario.load import LoadedScenario, load_scenario, named_files
-from exlinn_fmi.stages import Stages, fingerprint
+from exlinn_fmi.data.files import write_table, write_text
+from exlinn_fmi.errors import ExlinnError, InputError, RunError
+from exlinn_fmi.experiment import cosimulate, experiment
+from exlinn_fmi.factory import inspect
+from exlinn_fmi.stages import fingerprint
+from exlinn_fmi.workspace import Reporter, Run, Silent, metrics
 
 if TYPE_CHECKING:
-    import pandas as pd
-
-    from exlinn_fmi.cosim.master import Trajectories
     from exlinn_fmi.data.dataset import Dataset
-    from exlinn_fmi.scenario.schema import AnyLearn, Experiment, LearnFromPlant, Scenario, Simulate
-
-COMPARED = ("L", "D")
-"""Plant outputs that, where there are any of that name, the report compares the learned 𝓛 and D with."""
-
-
-class Reporter(Protocol):
-    """Who is told how the work goes; the command line shows it, a library user may ignore it."""
-
-    def stage(self, name: str, detail: str) -> None:
-        """A stage begins."""
-
-    def update(self, fraction: float, text: str = "") -> None:
-        """The present stage is that far (0…1)."""
-
-    def note(self, text: str) -> None:
-        """Something that the user should know, e.g. a warning."""
-
-
-class Silent:
-    """A reporter that says nothing."""
-
-    def stage(self, name: str, detail: str) -> None:
-        """Nothing."""
-
-    def update(self, fraction: float, text: str = "") -> None:
-        """Nothing."""
-
-    def note(self, text: str) -> None:
-        """Nothing."""
-
-
-@dataclass
-class Run:
-    """One scenario being worked on in its folder.
-
-    Args:
-        loaded: the scenario, checked.
-        folder: where results go.
-        reporter: who is told of progress.
-        stop: whether the user asked to stop.
-    """
-
-    loaded: LoadedScenario
-    folder: Path
-    reporter: Reporter = field(default_factory=Silent)
-    stop: StopRequest = field(default_factory=StopRequest)
-    history: dict[str, dict[str, Any]] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
-
-    @classmethod
-    def open(
-        cls,
-        file: Path,
-        out: Path | None = None,
-        overrides: Sequence[str] = (),
-        reporter: Reporter | None = None,
-    ) -> Run:
-        """Read and check a scenario; nothing is run or written.
-
-        Args:
-            file: the scenario file.
-            out: run folder; ``runs/<scenario name>`` if not given.
-            overrides: ``key.path=value`` texts.
-            reporter: who is told of progress.
-
-        Raises:
-            ScenarioError: everything that is wrong with the scenario.
-        """
-        loaded = load_scenario(file, overrides, inspect)
-        return cls(loaded, out or Path("runs") / loaded.scenario.name, reporter or Silent())
-
-    @property
-    def scenario(self) -> Scenario:
-        """The scenario."""
-        return self.loaded.scenario
-
-    @property
-    def stages(self) -> Stages:
-        """What was done in the run folder before."""
-        return Stages(self.folder)
-
-    @property
-    def learn(self) -> AnyLearn:
-        """The scenario's `learn` section.
-
-        Raises:
-            InputError: it has none.
-        """
-        if self.scenario.learn is None:
-            raise InputError(f"{self.loaded.file}: this needs a `learn` section, and the scenario has none")
-        return self.scenario.learn
-
-    @property
-    def seed(self) -> int:
-        """The seed of learning."""
-        return self.learn.seed if self.learn.seed is not None else self.scenario.seed
-
-    def component(self, name: str) -> Component:
-        """Make a component of the scenario."""
-        return build(name, self.scenario, self.loaded.folder, self.folder)
-
-    def files(self, *sections: object) -> list[Path]:
-        """Files that sections of the scenario name: what results depend on beside the settings."""
-        folder = self.loaded.folder
-        return [folder / name for name in named_files(*sections, folder=folder)]
-
-    def warn(self, text: str) -> None:
-        """Tell the user, and the report, of something."""
-        self.warnings.append(text)
-        self.reporter.note(text)
-
-    # ── the run folder ───────────────────────────────────────────────────────────────────────────────────
-
-    def unchanged(self, stage: str, key: str, detail: str) -> bool:
-        """Whether a stage need not run again; if it must, say so and lay the run folder."""
-        if stage in self.history:
-            return True  # done or found unchanged a moment ago
-        if self.stages.holds(stage, key):
-            self.reporter.stage(stage, "unchanged since the last run")
-            self.noted(stage, "cached", None)
-            return True
-        self.reporter.stage(stage, detail)
-        self.stages.forget(stage)
-        write_text(self.folder / "scenario.yaml", self.loaded.text)
-        return False
-
-    def done(self, stage: str, key: str, written: Iterable[Path], began: float) -> None:
-        """Record that a stage is done."""
-        seconds = time.perf_counter() - began
-        self.stages.record(stage, key, written, seconds)
-        self.noted(stage, "ran", seconds)
-
-    def failed(self, stage: str, error: ExlinnError) -> ExlinnError:
-        """Record that a stage failed and why; gives the error back, to be raised."""
-        self.noted(stage, "failed", None, error=str(error))
-        return error
-
-    def noted(self, stage: str, status: str, seconds: float | None, **more: Any) -> None:
-        """Keep ``provenance.json`` up to date: where all that is in the folder came from."""
-        from exlinn_fmi.results.tables import provenance, write_provenance
-
-        self.history[stage] = {"status": status, "seconds": seconds}
-        files = self.files(self.scenario)
-        record = provenance(self.loaded.file, files, self.scenario.seed, self.history)
-        write_provenance(self.folder, record | {"warnings": self.warnings} | more)
-
-    def replace_metrics(self, prefixes: tuple[str, ...], new: Mapping[str, Any]) -> None:
-        """Replace the metrics that begin with one of the prefixes."""
-        kept = {name: value for name, value in metrics(self.folder).items() if not name.startswith(prefixes)}
-        write_json(self.folder / "metrics.json", kept | dict(new))
-
-
-# ── stages ───────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def run(work: Run) -> dict[str, Any]:
     """Do everything that the scenario asks for; the metrics are returned and stand in ``metrics.json``."""
-    if work.scenario.learn is not None:
-        train(work)
-    if work.scenario.simulate is not None:
-        simulate(work)
+    try:
+        if work.scenario.learn is not None:
+            train(work)
+        if work.scenario.simulate is not None:
+            simulate(work)
+    except RunError:
+        # The report shows what there is so far; should it fail as well, the first error is the one to tell.
+        with suppress(ExlinnError):
+            report(work.folder)
+        raise
     report(work.folder, work.reporter)
     return metrics(work.folder)
 
@@ -231,26 +79,6 @@ def collect(work: Run) -> Dataset:
         work.warn(note)
     work.done("collect", key, save_dataset(work.folder, dataset), began)
     return dataset
-
-
-def experiment(work: Run, learn: LearnFromPlant) -> Dataset:
-    """Excite the plant through the master as `learn.training` and `learn.test` say.
-
-    Raises:
-        RunError: the plant failed, or the user stopped the run; the rows so far are on disk.
-    """
-    from exlinn_fmi.data.dataset import Dataset
-
-    runs: list[Trajectories] = []
-    for spec in (*learn.training, *learn.test):
-        runs.append(excite(work, learn, spec))
-        if runs[-1].error is not None:
-            write_table(work.folder / "dataset", table(learn, runs), units(learn, runs[0]))
-            raise runs[-1].error
-    coordinates = tuple(c.coordinate() for c in learn.coordinates)
-    columns = {str(name): values.to_numpy() for name, values in table(learn, runs).items()}
-    held_out = tuple(range(len(learn.training), len(runs)))
-    return replace(Dataset.from_columns(columns, coordinates, units(learn, runs[0])), held_out=held_out)
 
 
 def train(work: Run) -> None:
@@ -310,7 +138,7 @@ def simulate(work: Run) -> None:
     began = time.perf_counter()
     components = {name: work.component(name) for name in scenario.components}
     for name, component in components.items():
-        for warning in getattr(component, "warnings", ()):
+        for warning in component.warnings:
             work.warn(f"{name}: {warning}")
     starts = {name: spec.start for name, spec in scenario.components.items()}
     result = cosimulate(work, components, scenario.connection_list(), span, starts)
@@ -335,61 +163,6 @@ def report(folder: Path, reporter: Reporter | None = None) -> Path:
     return write_report(folder)
 
 
-# ── what the stages share ────────────────────────────────────────────────────────────────────────────────
-
-
-def cosimulate(
-    work: Run,
-    components: Mapping[str, Component],
-    connections: Sequence[tuple[str, str]],
-    span: Simulate,
-    starts: Mapping[str, Mapping[str, float]],
-) -> Trajectories:
-    """Step components in lockstep over `span`, with progress and Ctrl-C minded."""
-    from exlinn_fmi.cosim.graph import Graph
-    from exlinn_fmi.cosim.master import Master
-
-    specs = work.scenario.components
-    own_steps = {name: step for name in components if name in specs and (step := specs[name].step)}
-    graph = Graph(components, connections)
-    master = Master(graph, span.start, span.stop, span.step, own_steps, span.algorithm, span.record)
-    return master.run(starts, lambda part, t: work.reporter.update(part, f"t = {t:.3f} s"), work.stop)
-
-
-def excite(work: Run, learn: LearnFromPlant, experiment: Experiment) -> Trajectories:
-    """Run one experiment on the plant: a source on each driven input, all that learning needs recorded."""
-    from exlinn_fmi.components.signals import SignalSource
-    from exlinn_fmi.scenario.schema import Simulate
-
-    plant = learn.plant
-    components = {plant: work.component(plant)}
-    connections = []
-    for k, (target, signal) in enumerate(experiment.inputs.items()):
-        components[f"source_{k}"] = SignalSource(f"source_{k}", signal, work.loaded.folder)
-        connections.append((f"source_{k}.y", target))
-    outputs = {v.name for v in components[plant].variables if v.causality == "output"}
-    paths = [p for c in learn.coordinates for p in (c.position, c.velocity, c.acceleration, c.input) if p]
-    paths += [f"{plant}.{name}" for name in COMPARED if name in outputs]
-    span = Simulate(stop=experiment.duration, step=experiment.step, record=list(dict.fromkeys(paths)))
-    starts = {plant: {**work.scenario.components[plant].start, **experiment.start}}
-    return cosimulate(work, components, connections, span, starts)
-
-
-def table(learn: LearnFromPlant, runs: Sequence[Trajectories]) -> pd.DataFrame:
-    """All experiments in one table: trajectory number, time, and the plant's variables by their own names."""
-    import pandas as pd
-
-    frames = [run.frame.rename(columns=lambda name: name.removeprefix(f"{learn.plant}.")) for run in runs]
-    for number, frame in enumerate(frames):
-        frame.insert(0, "trajectory", number)
-    return pd.concat(frames, ignore_index=True)
-
-
-def units(learn: LearnFromPlant, run: Trajectories) -> dict[str, str]:
-    """Units of the columns of `table`."""
-    return {name.removeprefix(f"{learn.plant}."): unit for name, unit in run.units.items()}
-
-
 def truth(work: Run) -> dict[str, float]:
     """Values of the plant's parameters, as far as it states them; the scenario's start values count."""
     from exlinn_fmi.scenario.schema import LearnFromPlant
@@ -412,10 +185,3 @@ def uses_learned(section: Any) -> bool:
     if isinstance(section, Mapping):
         return section.get("model") == "learned" or any(map(uses_learned, section.values()))
     return False
-
-
-def metrics(folder: Path) -> dict[str, Any]:
-    """The metrics of a run folder by name, {} where there are none yet."""
-    file = folder / "metrics.json"
-    found: dict[str, Any] = read_json(file) if file.exists() else {}
-    return found

@@ -14,7 +14,7 @@ Life of a component:
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Literal
@@ -76,11 +76,13 @@ class Component(ABC):
         name: name in the scenario.
         variables: all variables; an index into this tuple addresses one.
         message: what the component last said of a status other than OK.
+        warnings: what the user should know before a run, e.g. of settings that do not fit together.
     """
 
     name: str
     variables: tuple[Variable, ...]
     message: str = ""
+    warnings: Sequence[str] = ()
 
     @property
     def sampled(self) -> bool:

@@ -266,6 +266,7 @@ def test_failing_component_exits_with_2_and_keeps_the_rows_so_far(
     frame = rows(tmp_path / "out")
     assert frame["time"].iloc[-1] == pytest.approx(0.5)
     assert frame.notna().all().all()
+    assert text in (tmp_path / "out/report.html").read_text()
 
 
 def test_full_disk_exits_with_2_and_leaves_no_half_file(

@@ -14,7 +14,7 @@ import pytest
 from exlinn_fmi import Run
 from exlinn_fmi import run as pipeline_run
 from exlinn_fmi.cli import exit_code
-from exlinn_fmi.pipeline import Silent
+from exlinn_fmi.workspace import Silent
 from tests.fmu_helpers import description_2, other_fmus, probe
 
 
@@ -110,10 +110,7 @@ def test_run_without_training_loads_no_torch(tracking: Path, root: Path, tmp_pat
 
     code = f"""
 import sys
-from exlinn_fmi import Run
-from exlinn_fmi import run as pipeline_run
 from exlinn_fmi.cli import exit_code
-from exlinn_fmi.pipeline import Silent
 assert exit_code(["simulate", {str(root / "scenarios/dcwc_tracking.yaml")!r}, "--out", {str(tracking)!r},
                   "--set", "simulate.stop=0.5"]) == 0
 assert "torch" not in sys.modules
