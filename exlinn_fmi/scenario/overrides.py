@@ -78,6 +78,8 @@ def _set(document: Any, keys: list[str], value: Any) -> KeyPath:
         key, rest = _next(at, annotation, keys, path, value)
         path.append(key)
         if not rest:
+            if isinstance(entry(at, key), dict | list):
+                at.ca.items.pop(key, None)  # comments about what was inside go with it
             at[key] = value
             return tuple(path)
         annotation = below(annotation, key, at)

@@ -52,6 +52,12 @@ def test_a_key_path_leads_to_its_value(override, keys, value):
     assert (found, misfits, list(applied)) == (value, [], [keys])
 
 
+def test_a_section_goes_with_the_comments_inside():
+    text = "learn:\n  test:\n    # why\n    - duration: 2  # short\n  method:\n    preset: paper\n"
+    changed, _, _ = apply(text, ["learn.test=[]"])
+    assert changed == "learn:\n  test: []\n  method:\n    preset: paper\n"
+
+
 def test_missing_sections_are_made(tmp_path):
     text = "name: a\ncomponents:\n  src: {source: {signal: constant, value: 1}}\n"
     loaded = load(tmp_path, text, ["simulate.stop=2", "metrics.settle=1"])
