@@ -14,7 +14,7 @@ import pandas as pd
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from exlinn_fmi.data.dataset import MINIMUM_ROWS, Dataset
+from exlinn_fmi.data.dataset import MINIMUM_ROWS
 from exlinn_fmi.data.derivatives import derivative, noise_level
 from exlinn_fmi.data.foreign import ForeignTable
 from exlinn_fmi.errors import DataError
@@ -80,6 +80,10 @@ def check_recordings(
         raise DataError("\n".join(mistakes))
     states, inputs = state_names(coordinates), input_names(coordinates)
     notes = list(_constant_inputs(training, inputs))
+    for name in states:
+        signals = [r.frame[name].to_numpy() for r in training if name in r.frame]
+        if signals and (ratio := _signal_to_noise(signals)) < POOR:
+            notes.append(f"{name!r} varies only {ratio:.2g} times as much as its noise: excite it more")
     for recording in training:
         present = [name for name in states if name in recording.frame]
         notes += [
@@ -117,23 +121,22 @@ def _unusable(
                 f"{_files(training)}: {name!r} is {signals[0][0]:.6g} in all rows, so nothing can be learned "
                 "of it; excite it, choose another column, or leave the coordinate out"
             )
-        elif signals:
-            yield from _buried(name, signals, training)
+        elif signals and (ratio := _signal_to_noise(signals)) < BURIED:
+            yield (
+                f"{_files(training)}: {name!r} varies only {ratio:.2g} times as much as its noise from row "
+                "to row: it is not excited, or sampled too slowly; excite it more"
+            )
     inputs = input_names(coordinates)
     if inputs and not any(r.frame[name].any() for r in training for name in inputs):
         named = " and ".join(map(repr, inputs))
         yield f"{_files(training)}: {named} is 0 in all rows, so the model's scale stays open; drive an input"
 
 
-def _buried(name: str, signals: Sequence[Signal], training: Sequence[Recording]) -> Iterator[str]:
-    """That a quantity changes by noise only."""
-    spread = float(np.sqrt(np.mean([signal.var() for signal in signals])))
+def _signal_to_noise(signals: Sequence[Signal]) -> float:
+    """Standard deviation of a quantity over that of its noise."""
     noise = float(np.median([noise_level(signal) for signal in signals]))
-    if spread < BURIED * noise:
-        yield (
-            f"{_files(training)}: {name!r} varies by {spread:.3g} (standard deviation), and its noise "
-            f"from row to row is {noise:.3g}: it is not excited, or sampled too slowly; excite it more"
-        )
+    spread = float(np.sqrt(np.mean([signal.var() for signal in signals])))
+    return spread / noise if noise > 0 else np.inf
 
 
 def _constant_inputs(training: Sequence[Recording], inputs: Sequence[str]) -> Iterator[str]:
@@ -213,11 +216,14 @@ def _bends(away: Signal, length: int, start: int, least: float) -> bool:
 # ── what belongs together ────────────────────────────────────────────────────────────────────────────────
 
 
-def doubts(training: Dataset, measured: Set[str]) -> list[str]:
+def doubts(
+    parts: Sequence[pd.DataFrame], coordinates: tuple[Coordinate, ...], measured: Set[str]
+) -> list[str]:
     """What is doubtful in the trajectories to train on.
 
     Args:
-        training: on a regular grid.
+        parts: the trajectories, each on a regular grid.
+        coordinates: the generalised coordinates.
         measured: quantities that were measured, not estimated.
 
     Raises:
@@ -225,47 +231,35 @@ def doubts(training: Dataset, measured: Set[str]) -> list[str]:
     """
     notes: list[str] = []
     mistakes: list[str] = []
-    for c in training.coordinates:
-        if c.topology == "circle" and (share := _covered(training.frame[c.name], c.unit)) < 1:
+    for c in coordinates:
+        if c.topology == "circle" and (share := _covered([part[c.name] for part in parts], c.unit)) < 1:
             notes.append(
                 f"{c.name} covers {share:.0%} of the circle in training: elsewhere the model is a guess"
             )
         if c.topology != "cyclic" and {c.name, c.velocity} <= measured:
-            text, grave = _mismatch(training, c)
+            text, grave = _mismatch(parts, c)
             (mistakes if grave else notes).extend([text] if text else [])
-        for name in measured & {c.name, c.velocity}:
-            ratio = _signal_to_noise(training, name)
-            if ratio < POOR:
-                notes.append(f"{name} is only {ratio:.1f} times its noise: excite it more, or filter it")
     if mistakes:
         raise DataError("\n".join(mistakes))
     return notes
 
 
-def _covered(angle: pd.Series[float], unit: str) -> float:
+def _covered(angles: Sequence[pd.Series[float]], unit: str) -> float:
     """Share of the circle that an angle visits."""
     from exlinn_fmi.mechanics.learned import TURN
 
     turn = TURN.get(unit, 2 * np.pi)
-    sectors = np.floor(np.mod(angle.to_numpy(), turn) / turn * SECTORS)
+    sectors = np.floor(np.mod(np.concatenate(angles), turn) / turn * SECTORS)
     return len(np.unique(sectors)) / SECTORS
 
 
-def _signal_to_noise(data: Dataset, name: str) -> float:
-    """Standard deviation of a quantity over that of its noise."""
-    signals = [part[name].to_numpy() for _, part in data.frame.groupby("trajectory")]
-    noise = float(np.median([noise_level(signal) for signal in signals]))
-    spread = float(np.sqrt(np.mean([signal.var() for signal in signals])))
-    return spread / noise if noise > 0 else np.inf
-
-
-def _mismatch(data: Dataset, c: Coordinate) -> tuple[str, bool]:
+def _mismatch(parts: Sequence[pd.DataFrame], c: Coordinate) -> tuple[str, bool]:
     """What is to be said of a velocity that is not the derivative of its position, and whether it is grave.
 
     The true factor between the two lies between the two regressions, whichever of them is noisy.
     """
     slopes, speeds = [], []
-    for _, part in data.frame.groupby("trajectory"):
+    for part in parts:
         slopes.append(derivative(part["time"].to_numpy(), part[c.name].to_numpy()))
         speeds.append(part[c.velocity].to_numpy())
     slope, speed = np.concatenate(slopes), np.concatenate(speeds)

@@ -1,8 +1,8 @@
 """Measured data: recordings from files to a data set of trajectories on a regular grid.
 
 Each file is read, converted to the model's quantities and units, checked row by row, cut where the clock has
-gaps, and where asked for (or needed, because steps differ) resampled and filtered. What is missing of
-velocities and accelerations is then estimated as for any data set (`dataset.estimate_missing`).
+gaps, and evened out where its steps differ. Then what is missing of velocities and accelerations is estimated
+(`dataset.estimate_missing`), and all is filtered and resampled where that is asked for.
 """
 
 from __future__ import annotations
@@ -62,21 +62,23 @@ def import_measured(data: Measured, coordinates: tuple[Coordinate, ...], folder:
             mistakes.append(str(error))
     if mistakes:
         raise DataError("\n".join(mistakes))
-    count = len(training)
+    count, inputs = len(training), input_names(coordinates)
     notes = [note for recording in recordings for note in recording.table.notes] + _estimated(recordings)
     notes += check_recordings(recordings[:count], recordings[count:], coordinates)
-    frames: list[pd.DataFrame] = []
-    held: list[int] = []
-    for k, recording in enumerate(recordings):
-        parts, more = trajectories(recording, data, input_names(coordinates))
+    groups: list[list[pd.DataFrame]] = []
+    for recording in recordings:
+        parts, more = regular(recording, data, inputs)
+        parts = [estimate_missing(part.assign(trajectory=0), coordinates) for part in parts]
+        groups.append([low_pass(part, data.filter, recording.name) for part in parts])
         notes += more
-        numbers = range(len(frames), len(frames) + len(parts))
-        frames += [part.assign(trajectory=n) for n, part in zip(numbers, parts, strict=True)]
-        held += numbers if k >= count else []
-    frame = pd.concat([estimate_missing(f, coordinates) for f in frames], ignore_index=True)
-    dataset = Dataset(frame[required_columns(coordinates)], coordinates, held_out=tuple(held))
-    measured = set.intersection(*(set(r.frame.columns) for r in recordings))
-    notes += doubts(dataset.training, measured)
+    measured = set.intersection(*(set(recording.frame.columns) for recording in recordings))
+    notes += doubts([part for group in groups[:count] for part in group], coordinates, measured)
+    grid = as_grid(data)
+    frames = [part if grid is None else resample(part, grid, inputs) for group in groups for part in group]
+    numbered = [frame.assign(trajectory=number) for number, frame in enumerate(frames)]
+    frame = pd.concat(numbered, ignore_index=True)[required_columns(coordinates)]
+    first = sum(map(len, groups[:count]))
+    dataset = Dataset(frame, coordinates, held_out=tuple(range(first, len(frames))))
     return replace(dataset, notes=tuple(notes if tests else [*notes, NO_TEST]))
 
 
@@ -201,10 +203,18 @@ def _check_time(table: ForeignTable, time: Signal, column: str) -> None:
 # ── from recording to trajectories ───────────────────────────────────────────────────────────────────────
 
 
-def trajectories(
+def as_grid(data: Measured) -> Resample | None:
+    """The grid that is asked for, where only its step may be given."""
+    return Resample(step=data.resample) if isinstance(data.resample, float | int) else data.resample
+
+
+def regular(
     recording: Recording, data: Measured, inputs: Sequence[str]
 ) -> tuple[list[pd.DataFrame], list[str]]:
-    """Cut a recording at gaps, bring it to a regular grid and filter it, as asked for or needed.
+    """Cut a recording at gaps, and even out its steps where they differ.
+
+    Velocities and accelerations are to be estimated from what comes of it: after a filter, or on another grid
+    than the recording's, noise would no longer look like noise.
 
     Args:
         recording: one file.
@@ -212,30 +222,23 @@ def trajectories(
         inputs: names of the inputs.
 
     Returns:
-        The trajectories, and what was done unasked.
+        The parts, each on a regular grid, and what was done unasked.
 
     Raises:
-        DataError: no part is long enough, or the filter does not fit the sampling.
+        DataError: no part is long enough.
     """
     time = recording.frame["time"].to_numpy()
     steps = np.diff(time)
     usual = float(np.median(steps))
     cuts = np.flatnonzero(steps > GAP * usual) + 1
-    bounds = [0, *cuts.tolist(), len(time)]
-    parts = [recording.frame.iloc[a:b] for a, b in pairwise(bounds)]
+    parts = [recording.frame.iloc[a:b] for a, b in pairwise([0, *cuts.tolist(), len(time)])]
     long = [part for part in parts if len(part) >= SHORTEST]
     notes = list(_gap_notes(recording, steps, cuts, usual, len(parts) - len(long)))
     within = np.delete(steps, cuts - 1)
-    uneven = bool(np.any(np.abs(within - usual) > EVEN * usual))
-    grid = Resample(step=data.resample) if isinstance(data.resample, float | int) else data.resample
-    if grid is None and uneven:
+    if np.any(np.abs(within - usual) > EVEN * usual):
         grid = Resample(step=_readable(float(within.sum() / np.round(within / usual).sum())))
-        notes.append(_jitter_note(recording, within, grid.step))
-    if grid is not None:
         long = [resample(part, grid, inputs) for part in long]
-    if data.filter is not None:
-        long = [low_pass(part, data.filter, recording.name) for part in long]
-    long = [part for part in long if len(part) >= SHORTEST]
+        notes += [] if data.resample else [_jitter_note(recording, within, grid.step)]
     if not long:
         raise DataError(
             f"{recording.name}: no part without gaps keeps {SHORTEST} rows or more; record for longer"
@@ -263,7 +266,7 @@ def _jitter_note(recording: Recording, steps: Signal, step: float) -> str:
     row = int(np.argmax(steps)) + 1
     return (
         f"{recording.name}: steps from {steps.min():.4g} to {steps.max():.4g} s (the largest at "
-        f"{recording.table.at(row)}): resampled to {step:g} s; say so with `resample: {step:g}`, or if only "
+        f"{recording.table.at(row)}): evened out to {step:g} s; say so with `resample: {step:g}`, or if only "
         f"the time stamps jitter give `step: {step:g}` in the place of `time`"
     )
 
@@ -312,12 +315,14 @@ def resample(frame: pd.DataFrame, grid: Resample, inputs: Sequence[str]) -> pd.D
     return result.reset_index(drop=True)
 
 
-def low_pass(frame: pd.DataFrame, options: LowPass, file: str) -> pd.DataFrame:
+def low_pass(frame: pd.DataFrame, options: LowPass | None, file: str) -> pd.DataFrame:
     """Filter all quantities of a trajectory forwards and backwards; the ends, where it settles, are left out.
 
     Raises:
-        DataError: the cut-off frequency is not below half of the sampling frequency.
+        DataError: the cut-off frequency is too high for the sampling, or too low for so few rows.
     """
+    if options is None:
+        return frame
     step = float(np.median(np.diff(frame["time"].to_numpy())))
     if options.cutoff >= 0.5 / step:
         raise DataError(
@@ -325,6 +330,11 @@ def low_pass(frame: pd.DataFrame, options: LowPass, file: str) -> pd.DataFrame:
             f"frequency, {0.5 / step:.4g} Hz; lower `filter.cutoff`, or leave the filter out"
         )
     settle = int(np.ceil(0.5 / (options.cutoff * step) - 1e-6))
+    if len(frame) < 2 * settle + SHORTEST:
+        raise DataError(
+            f"{file}: a part of {len(frame)} rows is too short for a filter with cut-off {options.cutoff:g} "
+            f"Hz, which takes {2 * settle} of them to settle; raise `filter.cutoff`, or leave the filter out"
+        )
     filtered = _butterworth(frame, options.cutoff, options.order)
     return filtered.iloc[settle : len(filtered) - settle].reset_index(drop=True)
 
