@@ -1,8 +1,9 @@
 """Monomials such as ``0.5*sin(alpha)^2*alpha_dot^2``: how a user names features and physical parameters.
 
-Grammar: ``[number*]factor(*factor)*`` with factor = ``name`` | ``sin(name)`` | ``cos(name)``, each with an
-optional ``^integer``. The same text serves as a feature of the paper's networks, as a term of 𝓛 or D that a
-parameter multiplies, and as a product of parameters (``m_c*d^2``).
+Grammar: ``[number*]factor(*factor)*`` with factor = ``name`` | ``function(argument)``, each with optional
+``^integer``; function = ``sin`` | ``cos`` | ``abs`` | ``logcosh`` | ``T1`` … ``T9`` (Chebyshev), argument =
+``[number*]name[±number]``. The same text serves as a feature of the paper's networks, as a term of 𝓛 or D
+that a parameter multiplies, and as a product of parameters (``m_c*d^2``).
 """
 
 from __future__ import annotations
@@ -11,31 +12,52 @@ import difflib
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import casadi as ca
 
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate, Parameter
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, Symbol
+from exlinn_fmi.mechanics.friction import log_cosh
 
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_DIGITS = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_NUMBER = re.compile(rf"[+-]?{_DIGITS}")
 _FACTOR = re.compile(
-    r"(?:(?P<function>sin|cos)\((?P<argument>[A-Za-z_]\w*)\)|(?P<name>[A-Za-z_]\w*))(?:\^(?P<power>-?\d+))?"
+    rf"(?:(?P<function>sin|cos|abs|logcosh|T[1-9])\((?:(?P<scale>[+-]?{_DIGITS})\*)?(?P<argument>[A-Za-z_]\w*)"
+    rf"(?P<shift>[+-]{_DIGITS})?\)|(?P<name>[A-Za-z_]\w*))(?:\^(?P<power>-?\d+))?"
 )
-
-
-Function = Literal["", "sin", "cos"]
-_FUNCTIONS: dict[str | None, Function] = {None: "", "sin": "sin", "cos": "cos"}
+_TIMES = re.compile(r"\*(?![^(]*\))")
 
 
 @dataclass(frozen=True)
 class Factor:
-    """One factor of a monomial: function(name)^power, the function being none, sin or cos."""
+    """One factor of a monomial: function(scale·name + shift)^power; without a function, name^power."""
 
     name: str
-    function: Function = ""
+    function: str = ""
     power: int = 1
+    scale: float = 1.0
+    shift: float = 0.0
+
+    def base(self, value: Any) -> Any:
+        """What is raised to the power, at a value of the name."""
+        at = value if (self.scale, self.shift) == (1, 0) else self.scale * value + self.shift
+        match self.function:
+            case "":
+                return value
+            case "sin":
+                return ca.sin(at)
+            case "cos":
+                return ca.cos(at)
+            case "abs":
+                return ca.fabs(at)
+            case "logcosh":
+                return log_cosh(at)
+        before, now = 1, at  # T_{k+1} = 2x T_k − T_{k−1}
+        for _ in range(int(self.function[1:]) - 1):
+            before, now = now, 2 * at * now - before
+        return now
 
 
 @dataclass(frozen=True)
@@ -53,10 +75,7 @@ class Monomial:
         """
         product: Any = self.coefficient
         for factor in self.factors:
-            base = values[factor.name]
-            if factor.function:
-                base = ca.sin(base) if factor.function == "sin" else ca.cos(base)
-            product = product * base**factor.power
+            product = product * factor.base(values[factor.name]) ** factor.power
         return product
 
 
@@ -70,7 +89,7 @@ def parse_monomial(text: str, names: Collection[str]) -> Monomial:
     Raises:
         ModelError: the text does not follow the grammar, or a name is not among `names`.
     """
-    parts = "".join(text.split()).split("*")
+    parts = _TIMES.split("".join(text.split()))
     number = _NUMBER.fullmatch(parts[0])
     factors = []
     for part in parts[1:] if number else parts:
@@ -78,12 +97,14 @@ def parse_monomial(text: str, names: Collection[str]) -> Monomial:
         if match is None:
             raise ModelError(
                 f"monomial {text!r}: {part or 'nothing'!r} is not a factor; expected [number*]factor*factor… "
-                "with factor = name, sin(name) or cos(name), each with an optional ^integer"
+                "with factor = name, sin(name), cos(name), abs(name) or logcosh(name), each with an optional "
+                "^integer"
             )
         name = match["argument"] or match["name"]
         if name not in names:
             raise ModelError(f"monomial {text!r}: unknown name {name!r}; {_suggest(name, names)}")
-        factors.append(Factor(name, _FUNCTIONS[match["function"]], int(match["power"] or 1)))
+        function, power = match["function"] or "", int(match["power"] or 1)
+        factors.append(Factor(name, function, power, float(match["scale"] or 1), float(match["shift"] or 0)))
     if not factors:
         raise ModelError(f"monomial {text!r}: expected at least one name, found only a number")
     return Monomial(float(parts[0]) if number else 1.0, tuple(factors))
@@ -136,20 +157,46 @@ class MonomialBasis:
         q, v = ca.SX.sym("q", len(self.coordinates)), ca.SX.sym("v", len(self.coordinates))
         return ca.Function("basis", [q, v], [ca.densify(ca.vertcat(*self.expressions(q, v)))])
 
+    @property
+    def size(self) -> int:
+        """Number of terms K of 𝓛 and D together."""
+        return len(self.lagrangian) + len(self.dissipation)
+
+    def system(self) -> LagrangianSystem:
+        """The family 𝓛 = Σ p_k φ_k, D = Σ p_k ψ_k, with parameters p in that order, 1 by default."""
+        count = len(self.lagrangian)
+
+        def weighted(p: Symbol, terms: Symbol, first: int) -> Symbol:
+            return sum((p[first + k] * terms[k] for k in range(terms.shape[0])), start=ca.SX(0))
+
+        return LagrangianSystem.build(
+            self.coordinates,
+            lambda q, v, p: weighted(p, self.expressions(q, v)[0], 0),
+            lambda v, p: weighted(p, self.expressions(0 * v, v)[1], count),
+            tuple(Parameter(f"p{k}", 1.0, "") for k in range(self.size)),
+        )
+
     def regressor(self) -> ca.Function:
         """(q, v, a) → columns d/dt ∂φ_k/∂q̇ − ∂φ_k/∂q, then ∂ψ_k/∂q̇, shape (n, K): F = columns · p by (17)."""
-        n, count = len(self.coordinates), len(self.lagrangian)
-        parameters = tuple(Parameter(f"p{k}", 1.0, "") for k in range(count + len(self.dissipation)))
-        q, v, a = (ca.SX.sym(name, n) for name in "qva")
-        p = ca.SX.sym("p", len(parameters))
-        phi, psi = self.expressions(q, v)
-        system = LagrangianSystem(
-            self.coordinates,
-            ca.Function("L", [q, v, p], [sum((p[k] * phi[k] for k in range(count)), start=ca.SX(0))]),
-            ca.Function(
-                "D", [v, p], [sum((p[count + k] * psi[k] for k in range(psi.shape[0])), start=ca.SX(0))]
-            ),
-            parameters,
-        )
-        columns = ca.jacobian(system.inverse(q, v, a, p), p)
+        q, v, a = (ca.SX.sym(name, len(self.coordinates)) for name in "qva")
+        p = ca.SX.sym("p", self.size)
+        columns = ca.jacobian(self.system().inverse(q, v, a, p), p)
         return ca.Function("regressor", [q, v, a], [ca.densify(columns)])
+
+    def momenta(self) -> ca.Function:
+        """(q, v) → columns ∂φ_k/∂q̇, shape (n, K), 0 for D: F = d/dt(momenta · p) + rest · p."""
+        return self._parts()[0]
+
+    def rest(self) -> ca.Function:
+        """(q, v) → columns −∂φ_k/∂q, then ∂ψ_k/∂q̇, shape (n, K): what needs no derivative in time."""
+        return self._parts()[1]
+
+    def _parts(self) -> tuple[ca.Function, ca.Function]:
+        q, v = (ca.SX.sym(name, len(self.coordinates)) for name in "qv")
+        phi, psi = self.expressions(q, v)
+        momenta = ca.vertcat(ca.jacobian(phi, v), ca.SX.zeros(psi.shape[0], q.shape[0])).T
+        rest = ca.vertcat(-ca.jacobian(phi, q), ca.jacobian(psi, v)).T
+        return (
+            ca.Function("momenta", [q, v], [ca.densify(momenta)]),
+            ca.Function("rest", [q, v], [ca.densify(rest)]),
+        )

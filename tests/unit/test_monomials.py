@@ -37,7 +37,9 @@ def test_texts_of_the_grammar_are_read(text: str, monomial: Monomial) -> None:
     assert parse_monomial(text, NAMES) == monomial
 
 
-@pytest.mark.parametrize("text", ["", "2", "2*", "i+i", "tan(i)", "i^0.5", "i**2", "sin(2*i)", "2i", "i*3"])
+@pytest.mark.parametrize(
+    "text", ["", "2", "2*", "i+i", "tan(i)", "i^0.5", "i**2", "sin(2i)", "tanh(i)", "2i", "i*3"]
+)
 def test_other_texts_are_refused_with_the_grammar_or_the_reason(text: str) -> None:
     with pytest.raises(ModelError, match=r"factor|at least one name"):
         parse_monomial(text, NAMES)

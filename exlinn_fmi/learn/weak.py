@@ -1,0 +1,114 @@
+"""Euler–Lagrange equations against smooth test functions: linear least squares without accelerations.
+
+With φ of compact support, ∫ φ F dt = ∫ (−φ̇ ∂𝓛/∂q̇ − φ ∂𝓛/∂q + φ ∂D/∂q̇) dt: no derivative of the data is needed
+and noise is averaged over the windows. It needs no start, which makes it the start for everything else.
+
+References: Messenger, Bortz (2021), Multiscale Model. Simul. 19, 1474 (weak form); eq. (11).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy.polynomial import Polynomial
+from numpy.typing import NDArray
+
+from exlinn_fmi.data.dataset import Dataset
+from exlinn_fmi.mechanics.euler_lagrange import evaluate
+from exlinn_fmi.mechanics.monomials import MonomialBasis
+
+Array = NDArray[np.float64]
+
+LONGEST = 1600
+"""Rows in a window, …"""
+WINDOWS = 6
+"""… unless that many windows do not fit into the longest trajectory beside one another."""
+OVERLAP = 16
+"""Windows begin a 16th of their length apart."""
+BUMP: Polynomial = Polynomial([1, 0, -1]) ** 7
+"""φ(s) on [−1, 1], six times differentiable at the ends."""
+CUT = 1e-12
+"""Singular values below this share of the largest are not determined."""
+
+
+class Regression(NamedTuple):
+    """F = columns · p for each row and equation, forces relative to their scale."""
+
+    columns: Float[Array, "R n P"]
+    force: Float[Array, "R n"]
+
+    def solve(self, ridge: float = 0.0) -> Float[Array, " P"]:
+        """Least squares with columns scaled to one.
+
+        Args:
+            ridge: weight of ‖p‖² in that scale.
+        """
+        size = np.linalg.norm(self.columns, axis=(0, 1))
+        size[size == 0] = 1
+        matrix = (self.columns / size).reshape(self.force.size, len(size))
+        right = self.force.ravel()
+        if ridge:
+            matrix = np.vstack([matrix, np.sqrt(ridge) * np.eye(len(size))])
+            right = np.concatenate([right, np.zeros(len(size))])
+        return np.asarray(np.linalg.lstsq(matrix, right, rcond=CUT)[0] / size)
+
+    def misfit(self, p: Float[Array, " P"]) -> float:
+        """What is left unexplained, as a share of the forces."""
+        return float(np.linalg.norm(self.columns @ p - self.force) / np.linalg.norm(self.force))
+
+
+def inverse_regression(basis: MonomialBasis, data: Dataset) -> Regression:
+    """The inverse model (17) at the samples, accelerations as they stand in the data."""
+    q, v, a, force = data.arrays
+    scale = force_scale(data)
+    columns = evaluate(basis.regressor(), q, v, a).reshape(*v.shape, basis.size)
+    return Regression(columns / scale[:, None], force / scale)
+
+
+def weak_regression(basis: MonomialBasis, data: Dataset) -> Regression:
+    """The equations against test functions, in windows that overlap."""
+    scale = force_scale(data)
+    momenta, rest = basis.momenta(), basis.rest()
+    q, v, _, force = data.arrays
+    columns, forces = [], []
+    for rows, phi, slope, held in _windows(data):
+        shape = (len(rows), v.shape[1], basis.size)
+        p = evaluate(momenta, q[rows], v[rows]).reshape(shape)
+        r = evaluate(rest, q[rows], v[rows]).reshape(shape)
+        columns.append(np.tensordot(phi, r, axes=(1, 0)) - np.tensordot(slope, p, axes=(1, 0)))
+        forces.append(held @ force[rows])
+    return Regression(np.concatenate(columns) / scale[:, None], np.concatenate(forces) / scale)
+
+
+def force_scale(data: Dataset) -> Float[Array, " n"]:
+    """What generalised forces are measured in: in each equation the one that makes the power of the inputs."""
+    _, v, _, force = data.arrays
+    speed = np.sqrt(np.mean(v**2, axis=0))
+    power = np.sqrt(np.mean(force**2, axis=0)) * speed
+    return np.asarray(power.max() / speed)
+
+
+def _windows(data: Dataset) -> Iterator[tuple[NDArray[np.intp], Array, Array, Array]]:
+    """For each trajectory its rows, and on them (C windows) h φ, h φ̇ and ∫φ over each row's step."""
+    numbers = data.frame["trajectory"].to_numpy()
+    time = data.frame["time"].to_numpy(dtype=float)
+    rows = [np.flatnonzero(numbers == k) for k in data.trajectories]
+    longest = max(map(len, rows))
+    half = max(min(LONGEST, longest // WINDOWS, longest - 1) // 2, 2)
+    integral = BUMP.integ()
+    s = np.arange(-half, half + 1) / half
+    for part in rows:
+        centres = np.arange(half, len(part) - half, max(2 * half // OVERLAP, 1))
+        if not len(centres):
+            continue
+        step = float(np.median(np.diff(time[part])))
+        phi, slope, held = (np.zeros((len(centres), len(part))) for _ in range(3))
+        for c, centre in enumerate(centres):
+            inside = slice(centre - half, centre + half + 1)
+            phi[c, inside] = BUMP(s) / half
+            slope[c, inside] = BUMP.deriv()(s) / (half**2 * step)
+            held[c, inside][:-1] = np.diff(integral(s))
+        yield part, phi, slope, held
