@@ -7,12 +7,15 @@ import pandas as pd
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from exlinn_fmi.components.lagrangian import LagrangianComponent
 from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 
 
 def free_run(system: LagrangianSystem, data: Dataset) -> Float[NDArray[np.float64], "N nx"]:
-    """Run the forward model (16) by RK4 from the first recorded state, inputs held from row to row.
+    """Run the forward model (16) from the first recorded state, inputs held from row to row.
+
+    It moves as it would in a co-simulation, in internal steps that its fastest pole allows.
 
     Args:
         system: the model.
@@ -21,16 +24,19 @@ def free_run(system: LagrangianSystem, data: Dataset) -> Float[NDArray[np.float6
     Returns:
         States at the rows of the data, not finite from where the run diverged.
     """
-    frame = data.frame
-    x0 = frame[system.state_names].to_numpy(dtype=float)[0]
-    if len(frame) == 1:
-        return np.array(x0[None])
-    inputs = frame[system.input_names].to_numpy(dtype=float)[:-1]
-    steps = np.diff(frame["time"].to_numpy(dtype=float))
-    run = system.rk4().mapaccum(len(steps))
-    parameters = np.tile(system.parameter_values[:, None], len(steps))
-    states = run(x0, inputs.T, parameters, steps[None])
-    return np.vstack([x0, np.array(states).T])
+    time = data.frame["time"].to_numpy(dtype=float)
+    states = data.frame[system.state_names].to_numpy(dtype=float)
+    inputs = data.frame[system.input_names].to_numpy(dtype=float)
+    model = LagrangianComponent("model", system)
+    model.enter_initialization(time[0], time[-1], dict(zip(system.state_names, states[0], strict=True)))
+    model.exit_initialization()
+    driven, moved = model.indices("input"), [model.index(name) for name in system.state_names]
+    run = states[:1].repeat(len(time), axis=0)
+    for k, step in enumerate(np.diff(time)):
+        model.set(driven, inputs[k])
+        model.step(time[k], step)
+        run[k + 1] = model.values[moved]
+    return run
 
 
 def nrmse(

@@ -189,7 +189,7 @@ class LagrangianSystem:
         x = ca.SX.sym("x", len(self.state_names))
         q, v = self.split_state(x)
         kept = [i for i, c in enumerate(self.coordinates) if c.topology != "cyclic"]
-        xdot = ca.vertcat(v[kept], self.forward(q, v, u, p))
+        xdot = ca.vertcat(*(v[i] for i in kept), self.forward(q, v, u, p))
         return ca.Function("derivative", [x, u, p], [xdot], ["x", "u", "p"], ["dx"])
 
     def split_state(self, x: Symbol) -> tuple[Symbol, Symbol]:

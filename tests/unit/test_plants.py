@@ -12,12 +12,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pandas import DataFrame
 from plant_helpers import CASES, column, parameters, random_points, start_state
 from scipy.integrate import solve_ivp
 
 from exlinn_fmi.components.lagrangian import LagrangianComponent
+from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.export.model import plant_model
+from exlinn_fmi.learn.rollout import free_run
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import MAX_INTERNAL_STEP, LagrangianSystem, evaluate
 from exlinn_fmi.mechanics.friction import log_cosh
@@ -436,3 +439,16 @@ def test_the_step_follows_the_start_state_of_the_plant() -> None:
     """A current of 100 A makes the field stiff for the ball: ω ≈ i √(l_1/m)/a."""
     strong = replace(LEVITATION, start={"x": 0.0, "i": 100.0})
     assert strong.system.solver_step(strong.start) < LEVITATION.system.solver_step(LEVITATION.start) / 10
+
+
+def test_a_free_run_follows_a_pole_faster_than_the_rows() -> None:
+    """A coil with l/r = 0.2 ms, seen every millisecond: Runge–Kutta steps of that length would diverge."""
+    coil = LagrangianSystem.build(
+        (Coordinate("Q", "C", "electrical", "cyclic", "i", "A", input="v", input_unit="V"),),
+        lambda q, v, p: v[0] ** 2 / 2,
+        lambda v, p: 5e3 * v[0] ** 2 / 2,
+    )
+    time = np.linspace(0, 3e-3, 4)
+    i = 1 - np.exp(-5e3 * time)
+    frame = DataFrame({"trajectory": 0, "time": time, "i": i, "i_dot": 5e3 * (1 - i), "v": 5e3})
+    np.testing.assert_allclose(free_run(coil, Dataset(frame, coil.coordinates))[:, 0], i, atol=1e-9)
