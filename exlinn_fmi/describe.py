@@ -63,7 +63,7 @@ def describe_scenario(file: Path, overrides: Sequence[str]) -> str:
         if isinstance(learn, LearnFromData):
             tests = learn.data.hold_out or len(learn.data.test)
             training = len(learn.data.files) - learn.data.hold_out
-            lines.append(f"learns from measured data in {names}: {training} training files, {tests} tests")
+            lines.append(f"learns from measured files in {names}: {training} for training, {tests} held out")
         else:
             experiments = f"{len(learn.training)} training experiments, {len(learn.test)} tests"
             lines.append(f"learns {learn.plant} in {names}: {experiments}")

@@ -122,9 +122,10 @@ class Run:
         return [folder / name for name in named_files(*sections, folder=folder)]
 
     def warn(self, text: str) -> None:
-        """Tell the user, and the report, of something."""
-        self.warnings.append(text)
-        self.reporter.note(text)
+        """Tell the user, and the report, of something; once, however often it comes up."""
+        if text not in self.warnings:
+            self.warnings.append(text)
+            self.reporter.note(text)
 
     # ── the run folder ───────────────────────────────────────────────────────────────────────────────────
 

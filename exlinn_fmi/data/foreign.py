@@ -318,7 +318,7 @@ def _numbers(
         raise DataError(f"{path.name}: no rows below the column names")
     columns, mistakes = {}, []
     for name in frame.columns:
-        values = _as_numbers(frame[name])
+        values = _as_numbers(frame[name], "." if dialect is None else dialect.decimal)
         bad = np.flatnonzero(~np.isfinite(values))
         if not len(bad):
             columns[str(name)] = values
@@ -338,12 +338,13 @@ def _numbers(
     return ForeignTable(path, columns, first)
 
 
-def _as_numbers(column: pd.Series[Any]) -> Float[NDArray[np.float64], " N"]:
+def _as_numbers(column: pd.Series[Any], decimal: str) -> Float[NDArray[np.float64], " N"]:
     """A column as numbers, NaN where a cell holds none; date and time as seconds since the first row."""
     if pd.api.types.is_numeric_dtype(column):
         return np.asarray(column.to_numpy(dtype=float, na_value=np.nan))
     if not pd.api.types.is_datetime64_any_dtype(column):
-        numbers = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float)
+        cells = column.astype(str).str.replace(decimal, ".") if decimal != "." else column
+        numbers = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float)
         if np.isfinite(numbers).any():
             return np.asarray(numbers)
         column = pd.to_datetime(column, errors="coerce", format="ISO8601")

@@ -273,11 +273,8 @@ def _jitter_note(recording: Recording, steps: Signal, step: float) -> str:
 
 def _readable(step: float) -> float:
     """A step without the digits that measuring it has left."""
-    for digits in range(2, 7):
-        rounded = float(f"{step:.{digits}g}")
-        if abs(rounded - step) < EVEN * step:
-            return rounded
-    return step
+    forms = (float(f"{step:.{digits}g}") for digits in (2, 3, 4))
+    return next(form for form in forms if abs(form - step) < EVEN * step)
 
 
 def resample(frame: pd.DataFrame, grid: Resample, inputs: Sequence[str]) -> pd.DataFrame:

@@ -125,6 +125,7 @@ def test_the_delimiter_and_decimal_mark_may_be_given(tmp_path):
             "run.csv:2: 4 cells, expected 2 as there are names; is the decimal mark a",
         ),
         ("t,u\n0,1\n1,x\n2,y\n", "run.csv:3: column 'u': found 'x', expected a finite number (2 such rows"),
+        ("t;u\n0,5;1,5\n1,5;x\n2,5;3,5\n", "run.csv:3: column 'u': found 'x', expected a finite number; rep"),
         ("t,u\n0,1\n1,NA\n2,3\n", "run.csv:3: column 'u': found 'NA'"),
         ("t,u\n0,1\n,\n2,3\n", "run.csv:3: column 't': found nothing"),
         ('"t","u"\n"0","1"\n"1",""\n"2","3"\n', "run.csv:3: column 'u': found nothing"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,8 +13,10 @@ from measured_helpers import recording, write
 from scenario_helpers import SCENARIO, line_of, problem, problems
 
 from exlinn_fmi.describe import describe_scenario
+from exlinn_fmi.scenario.check_data import measured
 from exlinn_fmi.scenario.document import parse
 from exlinn_fmi.scenario.load import json_schema, load_scenario, named_files
+from exlinn_fmi.scenario.survey import survey
 from exlinn_fmi.scenario.units import conversion
 
 DATA = """\
@@ -66,7 +70,7 @@ def test_it_is_described(folder):
     file = folder / "valid.yaml"
     file.write_text(DATA)
     text = describe_scenario(file, ())
-    assert text.splitlines()[1] == "learns from measured data in alpha, Q: 2 training files, 1 tests"
+    assert text.splitlines()[1] == "learns from measured files in alpha, Q: 2 for training, 1 held out"
 
 
 def test_the_controller_around_a_model_of_data_is_checked_against_its_quantities(folder):
@@ -123,6 +127,15 @@ def test_a_column_that_no_file_has_is_told_of_once(folder):
         "learn.data.files[0]",
         "a.csv: j: no column 'j'; the columns are: time, phi, alpha_dot, i, u",
     )
+
+
+def test_the_section_of_the_guide_fits_the_recordings_that_come_with_exlinn(root):
+    blocks = re.findall(r"^```yaml\n(.*?)^```", (root / "docs/guide.md").read_text("utf-8"), re.S | re.M)
+    (section,) = [block for block in blocks if "  data:\n" in block]
+    folder = root / "scenarios"
+    found = survey(parse(f"name: guide\n{section}").data, folder, None)[0]
+    assert found.coordinates
+    assert list(measured(found)) == []
 
 
 def test_a_header_that_cannot_be_read_is_told_at_its_file(folder):
