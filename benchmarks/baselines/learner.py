@@ -148,7 +148,7 @@ class Learner(nn.Module, ABC):
         """Run freely from the first row of each test by RK4; gives every `STRIDE`-th row.
 
         States are as `learn.rollout` has them, at those rows; once a velocity has left the measured range by
-        the factor `LOST`, all that follows is NaN. The true plant run like this is off by less than 1e-4 of its
+        the factor `LOST`, all that follows is NaN. The true plant run like this errs by less than 1e-4 of its
         standard deviation.
         """
         samples = [self._dimensionless(test.arrays) for test in tests]

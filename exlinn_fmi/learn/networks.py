@@ -29,6 +29,7 @@ class _Forward:
     slopes: Float[Array, "B H nz"]
     outputs: Float[Array, "B O"]
     gradients: Float[Array, "B O nz"]
+    slip: Float[Array, "B n k"]
     residual: Float[Array, "B n"]
 
 
@@ -87,8 +88,9 @@ class StructuredNetworks:
         residual += coupling_columns(self.spec.layout, data.velocity) @ weights["lagrangian.coupling"]
         residual += weights["dissipation.viscous"] ** 2 * data.velocity
         a, s = weights["dissipation.friction"], friction_width(weights)
-        residual += (a**2 * s * np.tanh(data.velocity[:, :, None] / s)).sum(axis=2)
-        return _Forward(basis, slopes, outputs, gradients, residual)
+        slip = np.tanh(data.velocity[:, :, None] / s)
+        residual += np.einsum("nk,bnk->bn", a**2 * s, slip)
+        return _Forward(basis, slopes, outputs, gradients, slip, residual)
 
     def _basis(
         self, weights: dict[str, Array], data: Assembly
@@ -111,15 +113,79 @@ class StructuredNetworks:
         for t, (kind, i, j) in enumerate(layout.terms):
             if kind == "M":
                 left, right = outputs[:, rows[i]], outputs[:, rows[j]]
-                f[:, t] = (left * right).sum(axis=1) + (self.spec.epsilon[i] if i == j else 0.0)
-                df[:, t] = (left[:, :, None] * gradients[:, rows[j]]).sum(axis=1)
-                df[:, t] += (right[:, :, None] * gradients[:, rows[i]]).sum(axis=1)
+                f[:, t] = np.einsum("bc,bc->b", left, right) + (self.spec.epsilon[i] if i == j else 0.0)
+                df[:, t] = np.einsum("bc,bcz->bz", left, gradients[:, rows[j]])
+                df[:, t] += df[:, t] if i == j else np.einsum("bc,bcz->bz", right, gradients[:, rows[i]])
             else:
                 row = layout.outputs.index((kind, i, j))
                 f[:, t], df[:, t] = outputs[:, row], gradients[:, row]
         return f, df
 
     # ── derivatives ──────────────────────────────────────────────────────────────────────────────────────
+
+    def gradient(self, theta: Float[Array, " P"], data: Assembly) -> tuple[float, Float[Array, " P"]]:
+        """Mean square of the residual and its gradient by θ, in one pass back: no Jacobian is made."""
+        weights, layout = self.unpack(theta), self.spec.layout
+        forward = self._forward(weights, data)
+        pull = 2 / forward.residual.size * forward.residual
+        value, slope = self._pull_terms(
+            forward,
+            np.einsum("bnt,bn->bt", data.value, pull),
+            np.einsum("bntz,bn->btz", data.gradient, pull),
+        )
+        power = pull.T @ data.velocity  # (n, n)
+        parts = {
+            "lagrangian.output": value.T @ forward.basis
+            + np.tensordot(slope, forward.slopes, axes=((0, 2), (0, 2))),
+            "lagrangian.coupling": np.array([power[i, j] - power[j, i] for i, j in layout.couplings]),
+            "dissipation.viscous": 2 * weights["dissipation.viscous"] * np.diag(power),
+            **self._pull_hidden(weights, forward, data, value, slope),
+            **_pull_friction(weights, forward, data, pull),
+        }
+        return float(np.vdot(forward.residual, forward.residual)) / pull.size, self.pack(parts)
+
+    def _pull_terms(
+        self, forward: _Forward, f: Float[Array, "B T"], df: Float[Array, "B T nz"]
+    ) -> tuple[Float[Array, "B O"], Float[Array, "B O nz"]]:
+        """Derivatives by each output's value and gradient, from those by the functions f_t and ∂f_t/∂z."""
+        layout, rows = self.spec.layout, self.spec.layout.rows
+        value, slope = np.zeros(forward.outputs.shape), np.zeros(forward.gradients.shape)
+        for t, (kind, i, j) in enumerate(layout.terms):
+            if kind != "M":
+                row = layout.outputs.index((kind, i, j))
+                value[:, row] += f[:, t]
+                slope[:, row] += df[:, t]
+                continue
+            share = 2 if i == j else 1
+            by_value, by_gradient = share * f[:, t, None], share * df[:, t, None]
+            for one, other in [(rows[i], rows[j])] + [(rows[j], rows[i])] * (i != j):
+                value[:, one] += by_value * forward.outputs[:, other]
+                value[:, one] += np.einsum("bcz,bz->bc", forward.gradients[:, other], by_gradient[:, 0])
+                slope[:, one] += forward.outputs[:, other, None] * by_gradient
+        return value, slope
+
+    def _pull_hidden(
+        self,
+        weights: dict[str, Array],
+        forward: _Forward,
+        data: Assembly,
+        value: Float[Array, "B O"],
+        slope: Float[Array, "B O nz"],
+    ) -> dict[str, Array]:
+        """Derivatives by the hidden layer's weights, from those by the outputs."""
+        start = self.spec.layout.basis - self.spec.layout.hidden
+        w, out = (
+            weights["lagrangian.hidden.weight"],
+            weights["lagrangian.output"][:, start:],
+        )  # (h, nz), (O, h)
+        tanh = forward.basis[:, start:]
+        first = 1 - tanh**2
+        by_slope = np.matmul(out.T, slope) * first[:, :, None]  # (B, h, nz)
+        bias = value @ out * first - 2 * tanh * np.einsum("bhz,hz->bh", by_slope, w)
+        return {
+            "lagrangian.hidden.weight": bias.T @ data.z + by_slope.sum(axis=0),
+            "lagrangian.hidden.bias": bias.sum(axis=0),
+        }
 
     def jacobian(
         self, theta: Float[Array, " P"], data: Assembly
@@ -194,6 +260,19 @@ def _outputs(
     """Network outputs and their derivatives."""
     out = weights["lagrangian.output"]
     return basis @ out.T, np.matmul(out, slopes)
+
+
+def _pull_friction(
+    weights: dict[str, Array], forward: _Forward, data: Assembly, pull: Float[Array, "B n"]
+) -> dict[str, Array]:
+    """Derivatives by D's friction and width weights, from those by the residual."""
+    a, s = weights["dissipation.friction"], friction_width(weights)
+    slip = np.einsum("bn,bnk->nk", pull, forward.slip)
+    bend = np.einsum("bn,bnk->nk", pull * data.velocity, 1 - forward.slip**2) / s
+    return {
+        "dissipation.friction": 2 * a * s * slip,
+        "dissipation.width": a**2 * (slip - bend) * (s - NARROWEST),
+    }
 
 
 def _dissipation_columns(weights: dict[str, Array], data: Assembly) -> list[Array]:
