@@ -7,7 +7,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from exlinn_fmi.data.dataset import Dataset, Samples
+from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
+from exlinn_fmi.mechanics.learned import ModelSpec, Scales, Weights
 
 
 def multisine(
@@ -41,3 +44,80 @@ def simulate(
     frame["L"] = evaluate(system.lagrangian, q, v, p)[:, 0]
     frame["D"] = evaluate(system.dissipation, v, p)[:, 0]
     return frame
+
+
+def motor_cart(offset: float = 2.9, seconds: float = 4.0, seed: int = 1, trajectory: int = 0) -> pd.DataFrame:
+    """The paper's plant under a multisine voltage about a mean that turns it through the full circle."""
+    from exlinn_fmi.plants.dc_motor_cart import PLANT
+
+    time = np.arange(round(seconds * 500) + 1) * 2e-3
+    inputs = np.zeros((len(time), 2))
+    inputs[:, 1] = multisine(2.9, (0.1, 5), 20, offset, seed, time)
+    return simulate(PLANT.system, inputs, 2e-3, trajectory=trajectory)
+
+
+MOTOR_CART = (
+    Coordinate("alpha", "rad", topology="circle"),
+    Coordinate("Q", "C", "electrical", "cyclic", "i", "A", input="v", input_unit="V"),
+)
+"""Coordinates of the paper's plant as it is learned: no torque from outside."""
+
+
+def motor_cart_dataset(seconds: float = 4.0, seed: int = 1) -> Dataset:
+    """Two experiments on the paper's plant, forwards and backwards."""
+    frames = [motor_cart(sign * 2.9, seconds, seed + k, k) for k, sign in enumerate((1, -1))]
+    return Dataset(pd.concat(frames), MOTOR_CART)
+
+
+SOLENOID = (
+    Coordinate("x", "m", topology="line"),
+    Coordinate("Q", "C", "electrical", "cyclic", "i", "A", input="v", input_unit="V"),
+)
+
+
+def solenoid_dataset(seed: int = 1) -> Dataset:
+    """A plunger on a spring in a coil, L(x) = l_0 + l_1/(1 + x/a): nothing that a polynomial could hold."""
+    system = LagrangianSystem.build(
+        SOLENOID,
+        lambda q, v, p: (
+            0.05 * v[0] ** 2
+            + (0.05 + 0.05 / (1 + q[0] / 0.03)) * v[1] ** 2 / 2
+            - 1000 * (q[0] - 0.01) ** 2
+            + 0.981 * q[0]
+        ),
+        lambda v, p: 0.4 * v[0] ** 2 + v[1] ** 2,
+    )
+    time = np.arange(3001) * 1e-3
+    inputs = multisine(3.0, (0.3, 8), 25, 3.0, seed, time)[:, None]
+    return Dataset(simulate(system, inputs, 1e-3, np.array([0.01, 0, 0])), SOLENOID)
+
+
+def random_model(
+    seed: int, coordinates: tuple[Coordinate, ...], hidden: int = 4
+) -> tuple[ModelSpec, Weights]:
+    """A structured model with weights, scales and ε drawn at random."""
+    random = np.random.default_rng(seed)
+    n = len(coordinates)
+    line = np.array([c.topology == "line" for c in coordinates])
+    scales = Scales(
+        time=float(random.uniform(0.1, 10)),
+        energy=float(random.uniform(0.1, 10)),
+        position=tuple(random.uniform(0.1, 10, n).tolist()),
+        centre=tuple(np.where(line, random.uniform(-1, 1, n), 0).tolist()),
+        reach=tuple(np.where(line, random.uniform(0.5, 2, n), 1).tolist()),
+    )
+    epsilon = tuple(random.uniform(0.01, 0.1, n).tolist())
+    spec = ModelSpec("structured", coordinates, hidden, scales, epsilon)
+    weights = {
+        name: np.where(mask, random.standard_normal(mask.shape), 0.0)
+        for name, mask in spec.layout.free.items()
+    }
+    return spec, weights
+
+
+def random_samples(seed: int, coordinates: tuple[Coordinate, ...], rows: int = 12) -> Samples:
+    """Samples drawn at random; cyclic positions are 0."""
+    random = np.random.default_rng(seed)
+    q, v, a, force = random.standard_normal((4, rows, len(coordinates)))
+    q[:, [c.topology == "cyclic" for c in coordinates]] = 0
+    return Samples(q, v, a, force)

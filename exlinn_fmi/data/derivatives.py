@@ -87,10 +87,8 @@ def best_window(values: Signal, order: int = 1) -> int:
     sigma = max(noise_level(values), floor)
     tried: list[tuple[Signal, float]] = []
     chosen, size = SHORTEST, float(SHORTEST)
-    while size <= min(len(values), LONGEST):
+    while int(size) | 1 <= min(len(values), LONGEST):
         window = int(size) | 1
-        if window > len(values):
-            break
         estimate = _filter(values, window, order)
         deviation = sigma * float(np.linalg.norm(savgol_coeffs(window, DEGREE, deriv=order)))
         inner = slice(window // 2, len(values) - window // 2)

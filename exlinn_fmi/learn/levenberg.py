@@ -76,6 +76,8 @@ def levenberg_marquardt(
 
 def _solve(at: Normal, damping: Vector) -> Vector | None:
     """The damped Gauss–Newton step, None where the matrix is not positive definite in floating point."""
+    if not np.isfinite(at.matrix).all():
+        return None
     # Equilibrate first: columns of networks differ by many orders of magnitude.
     size = 1 / np.sqrt(np.diag(at.matrix) + damping)
     matrix = at.matrix * size[:, None] * size

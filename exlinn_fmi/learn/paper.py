@@ -10,8 +10,7 @@ What the paper leaves open is chosen as measured by `benchmarks/paper_seeds.py`:
 
 - Features enter as they are; divided by their rms fewer seeds reach the target.
 - Hidden biases are 1 and stay: they have no gradient (F sees them only through which units are on), while
-weight
-  decay would draw them to 0, where no unit is on at rest (φ = 0) and the mass matrix vanishes there.
+  weight decay would draw them to 0, where no unit is on at rest (φ = 0) and the mass matrix vanishes there.
 - Batches of 8: as reliable as smaller ones, and faster.
 - Of the weights after each epoch those are kept that are best on the validation data, M ≻ 0 going before.
 """

@@ -27,17 +27,17 @@ SAMPLES = 4000
 CUT = 1e-10
 """Singular values below this share of the largest are gauges."""
 SHARE = 0.1
-"""ε as a share of the smallest mass in the solution, …"""
+"""ε as a share of the smallest mass in the solution."""
 LEAST = 1e-2
-"""… which is not taken for smaller than this share of the mean; the same holds for friction."""
+"""Blocks of M closer to singular than this are not believed, nor friction below this share of the forces."""
 PLAIN = 0.3
 """Mass and friction where the solution is of no use, as a share of the forces in its equation."""
 NONE = 1e-6
 """Masses below this share of the forces in their equation are taken for none."""
 JOIN = 0.02
 """First weight of friction units, relative to the viscous one: small, so that they join without a jolt."""
-SPREAD = 0.1
-"""Size of what is drawn at random, relative to the mean of M and of D: units that are 0 would stay 0."""
+SPREAD = 1e-2
+"""Size of the columns of L that are drawn at random, relative to the others: columns of 0 would stay 0."""
 
 
 class Start(NamedTuple):
@@ -72,11 +72,12 @@ def linear_start(layout: Layout, data: Assembly, seed: int) -> Start:
     epsilon = np.zeros(len(found.forces))
     output = weights["lagrangian.output"]
     for block, columns in zip(layout.blocks, layout.columns, strict=True):
-        mean, epsilon[block] = _block_start(found.mass[:, block][:, :, block], found.forces[block])
-        factor = np.zeros((len(block), columns, layout.basis - layout.hidden))
+        factor = np.zeros((len(block), columns, part.basis.shape[1]))
+        known = factor[:, : len(block)]
+        known[:], epsilon[block] = _factor(found.mass[:, block][:, :, block], found.forces[block], part.basis)
+        size = np.linalg.norm(known, axis=(1, 2))
         drawn = random.standard_normal(factor[:, len(block) :].shape)
-        factor[:, len(block) :] = SPREAD * np.sqrt(np.diag(mean))[:, None, None] * drawn
-        factor[:, : len(block), 0] = np.linalg.cholesky(mean - np.diag(epsilon[block]))
+        factor[:, len(block) :] = SPREAD * size[:, None, None] * drawn
         for k, i in enumerate(block):
             output[layout.rows[i], : factor.shape[2]] = factor[k]
     for row, term in enumerate(layout.outputs):
@@ -126,16 +127,31 @@ def _solve(layout: Layout, part: Assembly) -> _Solution:
     return _Solution(functions, parts[-2], parts[-1], mass, forces)
 
 
-def _block_start(
-    mass: Float[Array, "B m m"], forces: Float[Array, " m"]
-) -> tuple[Float[Array, "m m"], Float[Array, " m"]]:
-    """Mean of a block of M, or a plain diagonal where that is no mass matrix, and ε."""
+def _factor(
+    mass: Float[Array, "B m m"], forces: Float[Array, " m"], basis: Float[Array, "B nd"]
+) -> tuple[Float[Array, "m m nd"], Float[Array, " m"]]:
+    """Coefficients of the Cholesky factor of a block of M on the direct path, and ε.
+
+    The block is drawn towards its mean as far as it is not positive definite everywhere; if not even the mean
+    is, a plain diagonal takes its place.
+    """
+    if not _believed(mass.mean(axis=0), forces):
+        mass = np.broadcast_to(np.diag(PLAIN * forces), mass.shape)
     mean = mass.mean(axis=0)
     diagonal = np.diag(mean)
-    if (diagonal > NONE * forces).all():
-        unit = np.sqrt(np.outer(diagonal, diagonal))
-        smallest = float(np.linalg.eigvalsh(mean / unit).min())
-        if smallest > LEAST:
-            least = max(float(np.linalg.eigvalsh(mass / unit).min()), LEAST * smallest)
-            return mean, SHARE * least * diagonal
-    return np.diag(PLAIN * forces), SHARE * LEAST * PLAIN * forces
+    unit = np.sqrt(np.outer(diagonal, diagonal))
+    smallest, least = (float(np.linalg.eigvalsh(matrix / unit).min()) for matrix in (mean, mass))
+    share = 1.0 if least > smallest / 2 else smallest / (2 * (smallest - least))
+    epsilon = SHARE * max(least, smallest / 2) * diagonal
+    factors = np.linalg.cholesky(mean + share * (mass - mean) - np.diag(epsilon))
+    size = len(diagonal)
+    coefficients: Array = np.linalg.lstsq(basis, factors.reshape(-1, size**2), rcond=CUT)[0]
+    return coefficients.T.reshape(size, size, -1), epsilon
+
+
+def _believed(mean: Float[Array, "m m"], forces: Float[Array, " m"]) -> bool:
+    """Whether the mean of a block of M is a mass matrix, and not nearly singular."""
+    diagonal = np.diag(mean)
+    if not (diagonal > NONE * forces).all():
+        return False
+    return float(np.linalg.eigvalsh(mean / np.sqrt(np.outer(diagonal, diagonal))).min()) > LEAST
