@@ -145,8 +145,8 @@ def _factor(
     epsilon = SHARE * max(least, smallest / 2) * diagonal
     factors = np.linalg.cholesky(mean + share * (mass - mean) - np.diag(epsilon))
     size = len(diagonal)
-    coefficients: Array = np.linalg.lstsq(basis, factors.reshape(-1, size**2), rcond=CUT)[0]
-    return coefficients.T.reshape(size, size, -1), epsilon
+    coefficients = np.linalg.lstsq(basis, factors.reshape(-1, size**2), rcond=CUT)[0]
+    return np.asarray(coefficients.T, dtype=np.float64).reshape(size, size, -1), epsilon
 
 
 def _believed(mean: Float[Array, "m m"], forces: Float[Array, " m"]) -> bool:
