@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Samples
 from exlinn_fmi.mechanics.coordinates import Coordinate
-from exlinn_fmi.mechanics.learned import ModelSpec, Scales, angular
+from exlinn_fmi.mechanics.learned import FAITHFUL, ModelSpec, Scales, angular
 
 Array = NDArray[np.float64]
 
@@ -164,7 +164,9 @@ def topology_features(
             slope[:, k], slope[:, k + 1] = factor * z[:, k + 1], -factor * z[:, k]
             k += 2
         else:
-            z[:, k] = (q[:, i] - spec.scales.centre[i]) / spec.scales.reach[i]
-            slope[:, k] = 1 / spec.scales.reach[i]
+            place = (q[:, i] - spec.scales.centre[i]) / spec.scales.reach[i]
+            beyond = np.maximum(np.abs(place) - FAITHFUL, 0)  # `mechanics.learned.saturate`
+            z[:, k] = place - np.sign(place) * (beyond - np.tanh(beyond))
+            slope[:, k] = (1 - np.tanh(beyond) ** 2) / spec.scales.reach[i]
             k += 1
     return z, slope

@@ -7,6 +7,8 @@ Two forms, each of two networks (𝓛 and D) that are trained together:
     coordinates. L, A and V are the outputs of one network with a hidden tanh layer and a direct path; K is a
     strictly triangular constant (a coupling like k_e·Q̇·α is linear in q, which no periodic function holds).
     D = Σᵢ ½ bᵢ² q̇ᵢ² + Σₖ aᵢₖ² sᵢₖ² log cosh(q̇ᵢ/sᵢₖ): convex, D(0) = 0, D'(0) = 0, of bounded curvature.
+    Positions of lines saturate far outside the data (`saturate`), so that M and V are bounded everywhere:
+    with M ≻ 0 and viscous friction, bounded inputs then move the model at bounded velocities for ever.
 ``features``
     The paper's: monomials of (q, q̇) into one hidden ReLU layer, one output, for 𝓛 and for D.
 
@@ -36,6 +38,9 @@ Weights = Mapping[str, NDArray[np.float64]]
 
 NARROWEST = 0.02
 """Least width of a friction unit, relative to the rms velocity: anything sharper is as good as a jump."""
+
+FAITHFUL = 2.0
+"""The position of a line is what it is within so many times its reach in the data; there it saturates."""
 
 TURN = {"rad": 2 * np.pi, "mrad": 2000 * np.pi, "deg": 360.0, "rev": 1.0}
 """A full turn in the units that an angle may have; any other is read as rad."""
@@ -303,7 +308,7 @@ def _relu_network(weights: Weights, network: str, inputs: Symbol) -> Symbol:
 
 
 def topology_features(spec: ModelSpec, q: Symbol) -> Symbol:
-    """Network inputs z(q): sin and cos of circles, (q − centre)/reach of lines."""
+    """Network inputs z(q): sin and cos of circles, (q − centre)/reach of lines, saturated."""
     assert spec.scales is not None
     features = []
     for i in spec.layout.positions:
@@ -311,8 +316,18 @@ def topology_features(spec: ModelSpec, q: Symbol) -> Symbol:
         if c.topology == "circle":
             features += [ca.sin(angular(c) * q[i]), ca.cos(angular(c) * q[i])]
         else:
-            features.append((q[i] - spec.scales.centre[i]) / spec.scales.reach[i])
+            features.append(saturate((q[i] - spec.scales.centre[i]) / spec.scales.reach[i]))
     return ca.vertcat(ca.SX(0, 1), *features)
+
+
+def saturate(z: Symbol) -> Symbol:
+    """Keep z up to ±`FAITHFUL`, lead it from there on twice differentiably towards ±(`FAITHFUL` + 1).
+
+    A polynomial of a position leads a model that has left its data off to infinity in finite time; nothing
+    is known there but that the plant would not do that.
+    """
+    beyond = ca.fmax(ca.fabs(z) - FAITHFUL, 0)
+    return z - ca.sign(z) * (beyond - ca.tanh(beyond))
 
 
 def _structured_lagrangian(spec: ModelSpec, weights: Weights, q: Symbol, v: Symbol) -> Symbol:
