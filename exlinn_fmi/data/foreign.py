@@ -7,6 +7,7 @@ are found out from the file. Whatever is wrong with a table is told with its fil
 from __future__ import annotations
 
 import codecs
+import csv
 import io
 import re
 from collections.abc import Iterable, Sequence
@@ -97,7 +98,10 @@ def read_foreign(
     text = _text(path)
     dialect = _dialect(path, text, wanted, delimiter, decimal)
     _check_names(path, wanted, dialect.names)
-    body, notes = _body(path, text, dialect)
+    try:
+        body, notes = _body(path, text, dialect)
+    except csv.Error as error:
+        raise DataError(f"{path.name}: cannot be read as CSV ({error}); is a quote not closed?") from error
     table = _numbers(path, _cells(path, body, dialect, wanted), dialect.first, dialect, body)
     if dialect.units:
         shown = ", ".join(filter(None, dialect.units))
@@ -168,7 +172,8 @@ def _text(path: Path, head: bool = False) -> str:
     except UnicodeDecodeError:
         text = raw.decode("latin-1")
     text = text.replace("\r\n", "\n").replace("\r", "\n")
-    text = re.sub(r"(\n[\t ;,|\x1a]*)+\Z", "", text)
+    while "\n" in text and not text[text.rindex("\n") :].strip("\n\t ;,|\x1a"):
+        text = text[: text.rindex("\n")]
     if not text.strip():
         raise DataError(f"{path.name}: the file is empty; expected a line of column names, then numbers")
     return text
@@ -214,11 +219,13 @@ def _rank(line: str, follower: str, delimiter: str, wanted: Sequence[str]) -> tu
 
 def split_line(line: str, delimiter: str) -> list[str]:
     """Cells of a line, without quotes and blanks around them."""
-    import csv
-
     if delimiter == " ":
         return line.split()
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
+    try:
+        cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+    except csv.Error:  # a cell that is longer than any is
+        return [line]
+    return [cell.strip() for cell in cells]
 
 
 def _is_number(cell: str) -> bool:
@@ -260,11 +267,13 @@ def _body(path: Path, text: str, dialect: Dialect) -> tuple[str, list[str]]:
 
 def _count_cells(body: str, delimiter: str, expected: int) -> Int[NDArray[np.int64], " N"]:
     """Number of cells in each line; a delimiter at the end that closes the last cell is not counted."""
+    if '"' in body:  # delimiters may stand within quotes
+        rows = csv.reader(io.StringIO(body), delimiter=delimiter, skipinitialspace=True)
+        return np.array([len(r) - (len(r) == expected + 1 and not r[-1].strip()) for r in rows], np.int64)
     raw = np.frombuffer(body.encode(), dtype=np.uint8)
-    bare = np.cumsum(raw == ord('"')) % 2 == 0  # not within quotes
-    ends = np.append(np.flatnonzero((raw == ord("\n")) & bare), len(raw))
-    marks = np.append(0, np.cumsum((raw == ord(delimiter)) & bare))
-    cells = np.diff(np.append(0, marks[ends])).astype(np.int64) + 1
+    ends = np.append(np.flatnonzero(raw == ord("\n")), len(raw))
+    marks = np.searchsorted(np.flatnonzero(raw == ord(delimiter)), ends)
+    cells = np.diff(marks, prepend=0) + 1
     starts = np.append(0, ends[:-1] + 1)
     closed = (raw[np.maximum(ends - 1, 0)] == ord(delimiter)) & (cells == expected + 1)
     return np.where(ends == starts, 0, cells - closed)
@@ -355,7 +364,7 @@ def _shown(column: pd.Series[Any], row: int, dialect: Dialect | None, body: str)
     """What a cell holds, as it stands in the file."""
     if dialect is not None:
         cells = split_line(body.split("\n", row + 1)[row], dialect.delimiter)
-        cell = cells[dialect.names.index(str(column.name))]
+        cell = "".join(cells[dialect.names.index(str(column.name)) :][:1])
     else:
         cell = "" if pd.isna(column.iloc[row]) else str(column.iloc[row])
     return repr(cell) if cell.strip() else "nothing"

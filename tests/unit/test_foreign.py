@@ -131,6 +131,12 @@ def test_the_delimiter_and_decimal_mark_may_be_given(tmp_path):
         ('"t","u"\n"0","1"\n"1",""\n"2","3"\n', "run.csv:3: column 'u': found nothing"),
         ('"t","u"\n"0","1"\n"1","2","3"\n', "run.csv:3: 3 cells, expected 2"),
         ('t,u\n0,1\n1,"2\n', "run.csv: cannot be read as CSV (Error tokenizing data"),
+        (
+            't,u\n0,1\n1,"2\n' + 70_000 * "3\n",
+            "run.csv: cannot be read as CSV (field larger than field limit",
+        ),
+        ('"' + 200_000 * "t", "run.csv: no rows below the column names"),
+        ('t,u\n0"1,1\n1,2\n', "run.csv:2: column 't': found '0\"1', expected a finite number"),
         ("t,u\n0,1\n1,\n2,\n", "run.csv:3: column 'u' ends here, 2 rows before the others"),
         ("t,u\n0,1e999\n", "run.csv:2: column 'u': found '1e999', expected a finite number"),
     ],

@@ -367,6 +367,28 @@ def test_a_test_file_with_the_numbers_of_a_training_file_is_refused(tmp_path):
         load(tmp_path, files=["a.csv"], test=["b.csv"])
 
 
+@given(st.data())
+@settings(max_examples=150, deadline=None)
+def test_a_damaged_file_is_read_or_refused_but_never_ends_in_a_bug(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("damaged")
+    text = recording(40).to_csv(index=False)
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(text) - 1))
+        length = data.draw(st.sampled_from([0, 1, 3, 40, 400]))
+        new = data.draw(
+            st.sampled_from(["", ",", ";", "\n", '"', "x", "-", "nan", "1e999", "\0", "#", "\t", "é", "9"])
+        )
+        text = text[:at] + new + text[at + length :]
+        if not text:
+            break
+    (folder / "run.csv").write_text(text, "utf-8")
+    try:
+        frame = load(folder).frame
+    except DataError:
+        return
+    assert np.isfinite(frame.to_numpy()).all()
+
+
 # ── doubtful data ────────────────────────────────────────────────────────────────────────────────────────
 
 
