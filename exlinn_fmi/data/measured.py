@@ -30,9 +30,11 @@ GAP = 4.5
 """A step of more than so many usual ones cuts a recording in two; missing rows below are interpolated."""
 GUARD = 0.8
 """Cut-off of the filter before decimation, as a share of the new Nyquist frequency."""
-
 CLOSE = 0.25
 """Rows are close to each other that lie less than this share of the usual step apart."""
+NO_TEST = (
+    "no file is held out (`test` or `hold_out`): the report card judges the model on what it was trained on"
+)
 
 Signal = Float[NDArray[np.float64], " N"]
 
@@ -54,14 +56,7 @@ def import_measured(data: Measured, coordinates: tuple[Coordinate, ...], folder:
         DataError: with file and row, for every file that cannot be used.
     """
     training, tests = held_out(data, seed)
-    recordings, mistakes = [], []
-    for name in (*training, *tests):
-        try:
-            recordings.append(record(folder / name, data, coordinates))
-        except DataError as error:
-            mistakes.append(str(error))
-    if mistakes:
-        raise DataError("\n".join(mistakes))
+    recordings = _record_all([folder / name for name in (*training, *tests)], data, coordinates)
     count, inputs = len(training), input_names(coordinates)
     notes = [note for recording in recordings for note in recording.table.notes] + _estimated(recordings)
     notes += check_recordings(recordings[:count], recordings[count:], coordinates)
@@ -82,11 +77,6 @@ def import_measured(data: Measured, coordinates: tuple[Coordinate, ...], folder:
     return replace(dataset, notes=tuple(notes if tests else [*notes, NO_TEST]))
 
 
-NO_TEST = (
-    "no file is held out (`test` or `hold_out`): the report card judges the model on what it was trained on"
-)
-
-
 def held_out(data: Measured, seed: int) -> tuple[list[str], list[str]]:
     """Files to train on and files held out, the latter as stated or drawn."""
     if not data.hold_out:
@@ -96,6 +86,21 @@ def held_out(data: Measured, seed: int) -> tuple[list[str], list[str]]:
         [name for k, name in enumerate(data.files) if k not in drawn],
         [name for k, name in enumerate(data.files) if k in drawn],
     )
+
+
+def _record_all(
+    paths: Sequence[Path], data: Measured, coordinates: tuple[Coordinate, ...]
+) -> list[Recording]:
+    """All files, or the mistakes in all of them."""
+    recordings, mistakes = [], []
+    for path in paths:
+        try:
+            recordings.append(record(path, data, coordinates))
+        except DataError as error:
+            mistakes.append(str(error))
+    if mistakes:
+        raise DataError("\n".join(mistakes))
+    return recordings
 
 
 def _estimated(recordings: Sequence[Recording]) -> list[str]:
