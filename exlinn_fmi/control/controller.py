@@ -19,15 +19,15 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
+from exlinn_fmi.components.base import Component, Indices, Status, Values
 from exlinn_fmi.control.diagnosis import diagnose
 from exlinn_fmi.control.ocp import Ocp, check_names
 from exlinn_fmi.control.reference import ReferenceGenerator, References
 from exlinn_fmi.control.solver import Plan, Solution, SolveStatus, make_solver
 from exlinn_fmi.errors import InputError, ModelError, nearest
-from exlinn_fmi.mechanics.coordinates import state_units
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
-from exlinn_fmi.scenario.schema import Nmpc, ScotchYoke
+from exlinn_fmi.scenario.derived import nmpc_variables
+from exlinn_fmi.scenario.schema import Nmpc
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class NmpcController(Component):
         self._step = step
         safe = np.array([options.safe_input.get(key, 0.0) for key in system.input_names])
         self._safe: NDArray[np.float64] = np.clip(safe, self._ocp.limits.u_min, self._ocp.limits.u_max)
-        self.variables = _variables(system, options)
+        self.variables = nmpc_variables(system.coordinates, options)
         self._measured = np.zeros(self._ocp.n)
         self._outputs = np.zeros(len(self.variables) - self._ocp.n)
         self._memory = _Memory()
@@ -244,51 +244,3 @@ class NmpcController(Component):
                 [following.kkt, seconds, float(following.fallbacks), following.slack],
             ]
         )
-
-
-def _variables(system: LagrangianSystem, options: Nmpc) -> tuple[Variable, ...]:
-    """Measurements, then inputs to apply, then how they came about."""
-    names, units = system.state_names, state_units(system.coordinates)
-    measured = tuple(
-        Variable(name, "input", "continuous", unit, start=0.0, description=f"measured {name}")
-        for name, unit in zip(names, units, strict=True)
-    )
-
-    def output(name: str, unit: str | None, description: str, kind: str = "Real") -> Variable:
-        return Variable(
-            name,
-            "output",
-            "discrete",
-            unit,
-            "Integer" if kind == "Integer" else "Enumeration" if kind == "Enumeration" else "Real",
-            description=description,
-            depends_on=tuple(names),
-        )
-
-    reference = options.reference
-    quantity = reference.trajectory.unit
-    if quantity is None:
-        if isinstance(reference.through, ScotchYoke):
-            quantity = "m"
-        elif reference.through is None:
-            quantity = units[names.index(reference.coordinate)]
-    return (
-        *measured,
-        *(
-            output(c.input, c.input_unit or None, "input to apply")
-            for c in system.coordinates
-            if c.input is not None
-        ),
-        output("reference", quantity, "what is to be followed"),
-        *(
-            output(f"reference_{name}", unit, f"reference of {name}")
-            for name, unit in zip(names, units, strict=True)
-        ),
-        output("cost", "1", "cost J of the plan"),
-        output("solve_status", "1", "0 solved, 1 iteration limit, 2 failed: fallback applied", "Enumeration"),
-        output("iterations", "1", "iterations of the solver", "Integer"),
-        output("kkt", "1", "KKT residual"),
-        output("solve_time", "s", "time that reference and solve took"),
-        output("fallbacks", "1", "fallbacks so far", "Integer"),
-        output("slack", "1", "largest violation of a state bound in the plan, over the bound's range"),
-    )
