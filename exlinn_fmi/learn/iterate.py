@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,8 @@ class Iterate:
         loss: mean square of the residual on the training data.
         validation_loss: the same on the validation data.
         stage: what the learner is doing.
+        step: iterates of a later step are preferred whatever their validation loss.
+        notes: what the user should know of them: into the model's provenance.
         proper: whether the mass matrix is positive definite throughout the data, as a forward model needs.
     """
 
@@ -25,8 +29,10 @@ class Iterate:
     validation_loss: float
     stage: str
     proper: bool = True
+    step: int = 0
+    notes: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def rank(self) -> tuple[bool, float]:
-        """The smaller the better: proper first, then by validation loss."""
-        return (not self.proper, self.validation_loss)
+    def rank(self) -> tuple[bool, int, float]:
+        """The smaller the better: proper first, then by step of the work, then by validation loss."""
+        return (not self.proper, -self.step, self.validation_loss)

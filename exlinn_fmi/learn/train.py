@@ -19,7 +19,7 @@ from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.learned import ModelSpec, learned_system
-from exlinn_fmi.scenario.schema import Paper, Structured
+from exlinn_fmi.scenario.schema import Objective, Paper, Structured, Terms
 
 Status = Literal["converged", "iterations", "interrupted"]
 HISTORY = ["iteration", "stage", "loss", "validation_loss", "seconds"]
@@ -77,10 +77,11 @@ class TrainedModel:
 def train(
     train: Dataset,
     validation: Dataset,
-    method: Structured | Paper,
+    method: Structured | Terms | Paper,
     seed: int,
     progress: Callable[[TrainProgress], None] | None = None,
     should_stop: Callable[[], bool] = lambda: False,
+    objective: Objective = "auto",
 ) -> TrainedModel:
     """Fit a model; keep the weights that are best on the validation data.
 
@@ -91,6 +92,7 @@ def train(
         seed: of the first weights and of batches.
         progress: told after each iteration.
         should_stop: asked after each iteration; the best weights so far are kept then.
+        objective: what a learner that has the choice makes small.
 
     Raises:
         DataError: nothing can be learned from the data.
@@ -98,7 +100,7 @@ def train(
     """
     check_excitation(train)
     began = time.perf_counter()
-    spec, iterates, total = _learner(train, validation, method, seed)
+    spec, iterates, total = _learner(train, validation, method, seed, objective)
     best: Iterate | None = None
     status: Status = "converged"
     rows: list[tuple[int, str, float, float, float]] = []
@@ -125,13 +127,14 @@ def train(
         "validation_loss": best.validation_loss,
         "samples": len(train),
         "data_sha256": _data_hash(train),
+        **best.notes,
     }
     history = pd.DataFrame(rows, columns=HISTORY)
     return TrainedModel(spec, best.weights, history, status, time.perf_counter() - began, provenance)
 
 
 def _learner(
-    train: Dataset, validation: Dataset, method: Structured | Paper, seed: int
+    train: Dataset, validation: Dataset, method: Structured | Terms | Paper, seed: int, objective: Objective
 ) -> tuple[ModelSpec, Iterator[Iterate], int]:
     """The model, its iterates, and the most iterations."""
     if isinstance(method, Paper):
@@ -142,6 +145,11 @@ def _learner(
 
         spec = paper_spec(train, method)
         return spec, iterate_paper(spec, train, validation, method, seed), method.epochs
+    if isinstance(method, Terms):
+        from exlinn_fmi.learn.terms import STAGES, iterate_terms, terms_spec
+
+        spec = terms_spec(train, method)
+        return spec, iterate_terms(spec, train, validation, objective), STAGES
     from exlinn_fmi.learn.structured import iterate_structured, structured_spec
 
     spec, start = structured_spec(train, method, seed)

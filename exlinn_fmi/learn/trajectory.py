@@ -12,7 +12,6 @@ References: Bock (1983), Recent advances in parameter identification for ODE (mu
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -69,18 +68,19 @@ class Segments:
         return float(self.counted.sum())
 
 
-def cut(data: Dataset, states: list[str], inputs: list[str]) -> Segments:
+def cut(data: Dataset, states: list[str], inputs: list[str], every: int = 1) -> Segments:
     """Cut a data set into segments.
 
     Args:
         data: trajectories at one equal step.
         states: names of the states x.
         inputs: names of the inputs u.
+        every: take every so many rows, under the mean of the inputs between them.
 
     Raises:
         DataError: the steps differ.
     """
-    frames = [part for _, part in data.frame.groupby("trajectory", sort=False) if len(part) > 1]
+    frames = [part for _, part in data.frame.groupby("trajectory", sort=False) if len(part) > every]
     steps = np.concatenate([np.diff(part["time"].to_numpy(dtype=float)) for part in frames])
     step = float(np.median(steps))
     if np.abs(steps - step).max() > EVEN * step:
@@ -88,24 +88,27 @@ def cut(data: Dataset, states: list[str], inputs: list[str]) -> Segments:
             f"data set: steps of {steps.min():.6g} s to {steps.max():.6g} s, expected one step throughout to "
             "fit to trajectories; resample the data, or choose the objective 'inverse'"
         )
-    k = int(np.clip(max(map(len, frames)) // SEGMENTS, SHORTEST, LONGEST))
+    k = int(np.clip(max(map(len, frames)) // (SEGMENTS * every), SHORTEST, LONGEST))
     measured, held, counted, follows = [], [], [], []
     for part in frames:
-        x, u = part[states].to_numpy(dtype=float), part[inputs].to_numpy(dtype=float)
-        for first in range(0, len(part) - 1, k):
+        x = part[states].to_numpy(dtype=float)[::every]
+        begins = np.arange(0, len(part), every)
+        widths = np.diff(np.append(begins, len(part)))[:, None]
+        u = np.add.reduceat(part[inputs].to_numpy(dtype=float), begins, axis=0) / widths
+        for first in range(0, len(x) - 1, k):
             rows = np.arange(first, first + k + 1)
-            at = np.minimum(rows, len(part) - 1)
-            last = first + k >= len(part) - 1
+            at = np.minimum(rows, len(x) - 1)
+            last = first + k >= len(x) - 1
             measured.append(x[at])
             held.append(u[at[:-1]])
-            counted.append((rows < len(part)) & (last | (rows < first + k)))
+            counted.append((rows < len(x)) & (last | (rows < first + k)))
             follows.append(-1 if last else len(measured))
     return Segments(
         np.array(measured),
         np.array(held).reshape(len(held), k, len(inputs)),
         np.array(counted, dtype=float),
         np.array(follows),
-        step,
+        step * every,
         noise_levels(data),
     )
 
@@ -208,6 +211,11 @@ class Shooting:
             x = self.predict(theta)
             return float(np.sum(self.residuals(x) ** 2) + np.sum(self._gaps(x, self.split(theta)[1]) ** 2))
 
+    def misprediction(self, p: Float[Array, " P"]) -> float:
+        """Sum of squares of predictions from the segments' first states as measured."""
+        with np.errstate(all="ignore"):
+            return float(np.sum(self.residuals(self.predict(self.start(p))) ** 2))
+
     def normal(self, theta: Float[Array, " T"]) -> Normal:
         """The sum of squares, half its gradient and its Gauss–Newton matrix."""
         data, (p, states) = self.data, self.split(theta)
@@ -261,7 +269,7 @@ def maximum_likelihood(
     p: Float[Array, " P"],
     states: Float[Array, "B nx"] | None = None,
     iterations: int = 30,
-    watch: Callable[[Float[Array, " P"], float], bool] = lambda p, value: False,
+    passes: int = 2,
 ) -> Fit:
     """Fit a family to trajectories, with the noise that was estimated, then with that of the residuals.
 
@@ -271,16 +279,16 @@ def maximum_likelihood(
         p: start.
         states: where segments start; as measured if not given.
         iterations: most Levenberg–Marquardt iterations each time.
-        watch: told p and the sum of squares after each; True ends the fit.
+        passes: how often; 1 keeps to the noise that was estimated.
     """
-    for _ in range(2):
+    for _ in range(passes):
         shooting = Shooting(system, data)
         theta, value = shooting.start(p, states), float("inf")
         for number, step in enumerate(levenberg_marquardt(theta, shooting.normal, shooting.value)):
             gained = value - step.value
             theta, value = step.theta, step.value
             p, states = shooting.split(theta)
-            if watch(p, value) or number >= iterations or gained < GAIN * value:
+            if number >= iterations or gained < GAIN * value:
                 break
         data = replace(data, sigma=shooting.noise(theta))
     shooting = Shooting(system, data)

@@ -84,7 +84,7 @@ def weak_regression(basis: MonomialBasis, data: Dataset) -> Regression:
 
 
 def force_scale(data: Dataset) -> Float[Array, " n"]:
-    """What generalised forces are measured in: in each equation the one that makes the power of the inputs."""
+    """Units of the generalised forces: in each equation the force that has the power of the inputs."""
     _, v, _, force = data.arrays
     speed = np.sqrt(np.mean(v**2, axis=0))
     power = np.sqrt(np.mean(force**2, axis=0)) * speed

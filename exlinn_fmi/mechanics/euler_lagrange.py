@@ -117,6 +117,19 @@ class LagrangianSystem:
         )
         return replace(self, coordinates=coordinates)
 
+    def bound(self, values: ArrayLike) -> LagrangianSystem:
+        """The same system with its parameters fixed: one that has none.
+
+        Args:
+            values: of the parameters, shape (r,).
+        """
+        p = ca.DM(np.asarray(values, dtype=float))
+        return LagrangianSystem.build(
+            self.coordinates,
+            lambda q, v, none: self.lagrangian(q, v, p),
+            lambda v, none: self.dissipation(v, p),
+        )
+
     # ── names and sizes ──────────────────────────────────────────────────────────────────────────────────
 
     @property

@@ -1,6 +1,6 @@
 """Learned extended Lagrangian systems: what the networks for 𝓛 and D look like, and their CasADi form.
 
-Two forms, each of two networks (𝓛 and D) that are trained together:
+Two forms of two networks (𝓛 and D) that are trained together, and one without any:
 
 ``structured``
     𝓛 = ½ q̇ᵀM(q)q̇ + (Kq + A(q))ᵀq̇ − V(q) with M = L(q)L(q)ᵀ + ε ≻ 0, apart for mechanical and electrical
@@ -11,6 +11,8 @@ Two forms, each of two networks (𝓛 and D) that are trained together:
     with M ≻ 0 and viscous friction, bounded inputs then move the model at bounded velocities for ever.
 ``features``
     The paper's: monomials of (q, q̇) into one hidden ReLU layer, one output, for 𝓛 and for D.
+``terms``
+    𝓛 = Σ p_k φ_k(q, q̇) and D = Σ p_k ψ_k(q̇) with monomials φ and ψ; those with p_k = 0 are left out.
 
 Networks see dimensionless quantities only: `Scales` carries the units, so that training does not know them.
 """
@@ -83,16 +85,16 @@ class ModelSpec:
     """Everything about a learned model but its weights.
 
     Args:
-        form: ``structured`` or ``features``.
+        form: ``structured``, ``features`` or ``terms``.
         coordinates: the generalised coordinates.
         hidden: units of the hidden layer of each network.
         scales: units of a structured model; None for features.
         epsilon: smallest dimensionless mass of each coordinate (structured), shape (n,).
-        lagrangian_features: monomials for 𝓛 (features).
-        dissipation_features: monomials for D (features).
+        lagrangian_features: monomials for 𝓛 (features and terms).
+        dissipation_features: monomials for D (features and terms).
     """
 
-    form: Literal["structured", "features"]
+    form: Literal["structured", "features", "terms"]
     coordinates: tuple[Coordinate, ...]
     hidden: int
     scales: Scales | None = None
@@ -149,7 +151,12 @@ class ModelSpec:
                     "output.weight": (self.hidden,),
                 }.items()
             }
-        raise ModelError(f"unknown form of model {self.form!r}; expected 'structured' or 'features'")
+        if self.form == "terms":
+            return {
+                "lagrangian.terms": (len(self.lagrangian_features),),
+                "dissipation.terms": (len(self.dissipation_features),),
+            }
+        raise ModelError(f"unknown form of model {self.form!r}; expected 'structured', 'features' or 'terms'")
 
 
 def _with_tuples(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -266,6 +273,10 @@ def learned_system(spec: ModelSpec, weights: Weights) -> LagrangianSystem:
         ModelError: an array is missing, of the wrong shape, or holds values that are not finite.
     """
     check_weights(spec, weights)
+    if spec.form == "terms":
+        p = np.concatenate([weights["lagrangian.terms"], weights["dissipation.terms"]])
+        found = MonomialBasis(spec.coordinates, spec.lagrangian_features, spec.dissipation_features)
+        return found.only(p != 0).system().bound(p[p != 0])
     if spec.form == "features":
         basis = MonomialBasis(spec.coordinates, spec.lagrangian_features, spec.dissipation_features)
         return LagrangianSystem.build(

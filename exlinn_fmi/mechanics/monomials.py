@@ -12,9 +12,12 @@ import difflib
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate, Parameter
@@ -161,6 +164,24 @@ class MonomialBasis:
     def size(self) -> int:
         """Number of terms K of 𝓛 and D together."""
         return len(self.lagrangian) + len(self.dissipation)
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """All terms in the order of the parameters."""
+        return self.lagrangian + self.dissipation
+
+    def only(self, chosen: NDArray[np.bool_]) -> MonomialBasis:
+        """The basis of some of the terms.
+
+        Args:
+            chosen: which, in the order of `terms`.
+        """
+        count = len(self.lagrangian)
+        return MonomialBasis(
+            self.coordinates,
+            tuple(compress(self.lagrangian, chosen[:count])),
+            tuple(compress(self.dissipation, chosen[count:])),
+        )
 
     def system(self) -> LagrangianSystem:
         """The family 𝓛 = Σ p_k φ_k, D = Σ p_k ψ_k, with parameters p in that order, 1 by default."""

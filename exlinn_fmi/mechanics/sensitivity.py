@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
+from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, Symbol
 
 Array = NDArray[np.float64]
 
@@ -56,8 +56,11 @@ class Propagator:
             [rate(x, u, p), ca.jacobian(rate(x, u, p), x), ca.jacobian(rate(x, u, p), p)],
         )
         n = x.shape[0]
-        kx, kp = ca.SX.zeros(n, n), ca.SX.zeros(n, p.shape[0])
-        k, sum_x, sum_p = ca.SX.zeros(n), 0, 0
+        k: Symbol = ca.SX.zeros(n)
+        kx: Symbol = ca.SX.zeros(n, n)
+        kp: Symbol = ca.SX.zeros(n, p.shape[0])
+        sum_x: Symbol = 0
+        sum_p: Symbol = 0
         for part, weight in zip((0, 1 / 2, 1 / 2, 1), (1, 2, 2, 1), strict=True):
             k, fx, fp = slope(x + part * h * k, u, p)
             kp = fp + part * h * ca.mtimes(fx, kp)

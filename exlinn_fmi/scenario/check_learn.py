@@ -29,6 +29,7 @@ from exlinn_fmi.scenario.schema import (
     SignalComponent,
     Structured,
     Table,
+    Terms,
 )
 from exlinn_fmi.scenario.survey import Role, Survey
 from exlinn_fmi.scenario.units import same_unit
@@ -211,10 +212,13 @@ def _monomials(learn: AnyLearn, coordinates: tuple[Coordinate, ...]) -> Iterator
             yield at, str(error)
 
 
-def _terms(method: Structured | Paper, identify: Identify) -> Iterator[tuple[KeyPath, str]]:
+def _terms(method: Structured | Terms | Paper, identify: Identify) -> Iterator[tuple[KeyPath, str]]:
     """All monomials of a `learn` section, with where they stand."""
     if isinstance(method, Paper):
         for key in ("lagrangian_features", "dissipation_features"):
+            yield from ((("learn", "method", key, k), text) for k, text in enumerate(getattr(method, key)))
+    if isinstance(method, Terms):
+        for key in ("lagrangian", "dissipation"):
             yield from ((("learn", "method", key, k), text) for k, text in enumerate(getattr(method, key)))
     for key in ("lagrangian", "dissipation"):
         for name, text in getattr(identify, key).items():

@@ -459,6 +459,19 @@ class Structured(Spec):
     regularisation: NonNegative = Field(1e-16, description="λ of the L2 term")
 
 
+class Terms(Spec):
+    """A sum of terms, found among generic ones: least squares, or maximum likelihood where data are noisy."""
+
+    preset: Literal["terms"]
+    lagrangian: list[str] = Field(
+        default_factory=list,
+        description="candidates for 𝓛, monomials; from the coordinates' topology if none are given",
+    )
+    dissipation: list[str] = Field(
+        default_factory=list, description="candidates for D; none are used where only those for 𝓛 are given"
+    )
+
+
 class Paper(Spec):
     """The paper's learner: feature functions into one hidden layer of ReLU units each, Adam."""
 
@@ -475,6 +488,9 @@ class Paper(Spec):
     weight_decay: NonNegative = Field(1e-5, description="λ of the L2 term")
     epochs: int = Field(20, ge=1, description="passes over the training data")
     batch: int = Field(8, ge=1, description="samples in a batch (the paper does not say)")
+
+
+Objective = Literal["auto", "inverse", "weak", "trajectory"]
 
 
 class Identify(Spec):
@@ -499,13 +515,64 @@ class Learn(Spec):
         0.8, gt=0, lt=1, description="share of the training data to fit; the rest validates"
     )
     split_blocks: int = Field(10, ge=1, description="time blocks that the split draws from")
-    method: Annotated[Structured | Paper, Field(discriminator="preset")] = Field(
+    method: Annotated[Structured | Terms | Paper, Field(discriminator="preset")] = Field(
         default_factory=lambda: Structured(preset="structured"), description="the learner"
+    )
+    objective: Objective = Field(
+        "auto",
+        description="what `terms` and `identify` make small: `inverse`: errors of forces, which takes "
+        "accelerations; `weak`: those against test functions, without accelerations; `trajectory`: errors of "
+        "predicted states, best under noise; `auto`: as the noise calls for",
     )
     identify: Identify = Field(
         default_factory=lambda: Identify(), description="physical parameters to read off"
     )
     seed: int | None = Field(None, ge=0, description="seed of split and weights; the scenario's if not given")
+
+
+class Noise(Spec):
+    """Noise of a sensor in the unit of what it measures."""
+
+    std: Positive = Field(description="standard deviation")
+
+
+NoiseLevel = Annotated[
+    Annotated[Positive, Tag("a number")] | Annotated[Noise, Tag("a mapping")], Discriminator(form)
+]
+
+
+class Limits(Spec):
+    """What an experiment must not exceed."""
+
+    inputs: dict[str, Bounds] = Field(
+        default_factory=dict,
+        description="bounds on inputs, by name; the range of the present training where not given",
+    )
+    states: dict[str, Bounds] = Field(default_factory=dict, description="bounds on states, by name")
+
+
+class Design(Spec):
+    """What `exlinn design` counts on when it looks for a better excitation."""
+
+    noise: (
+        Annotated[Positive, Tag("a number")] | Annotated[dict[str, NoiseLevel], Tag("a mapping")]
+    ) = Field(
+        0.01,
+        description="noise of the measured states: a share of each signal's standard deviation in the present "
+        "training, or by name a share or {std: …}; those not named are not measured",
+        discriminator=Discriminator(form),
+    )
+    limits: Limits = Field(default_factory=lambda: Limits(), description="what the experiment must not exceed")
+    duration: Positive | None = Field(
+        None, description="duration of the experiment [s]; that of the present training if not given"
+    )
+    band: Band | None = Field(None, description="frequencies that may be used [Hz]; from the model if not given")
+    candidates: int = Field(200, ge=10, le=100_000, description="multisines that are tried before refining")
+    model: str | None = Field(
+        None,
+        description="`learned`, `plant:NAME` or a folder with model.json; if not given the plant itself where it "
+        "is one of ours, else what `exlinn train` learned",
+    )
 
 
 class LearnFromPlant(Learn):
@@ -515,6 +582,9 @@ class LearnFromPlant(Learn):
     coordinates: list[PlantCoordinate] = Field(min_length=1, description="the generalised coordinates")
     training: list[Experiment] = Field(min_length=1, description="experiments to train on")
     test: list[Experiment] = Field(default_factory=list, description="experiments that training never sees")
+    design: Design = Field(
+        default_factory=lambda: Design(), description="for `exlinn design`: sensors and limits"
+    )
 
 
 class LearnFromData(Learn):

@@ -1,4 +1,4 @@
-"""Fits to noisy trajectories: noise estimates, weak form, sensitivities, maximum likelihood and its covariance."""
+"""Fits to noisy trajectories: noise, weak form, sensitivities, maximum likelihood and its covariance."""
 
 from __future__ import annotations
 
@@ -152,12 +152,3 @@ def test_what_is_known_of_one_parameter_where_the_others_are_known() -> None:
     information = Information(np.array([[2.0, 1.0], [1.0, 2.0]]))
     assert information.only(np.array([True, False])).covariance == pytest.approx(0.5)
     assert information.covariance[0, 0] == pytest.approx(2 / 3)
-
-
-def test_the_watcher_may_end_a_fit() -> None:
-    seen: list[float] = []
-    segments = cut(noisy(0.01), STATES, ["v"])
-    maximum_likelihood(
-        FAMILY.system(), segments, TRUE * 1.1, watch=lambda p, value: bool(seen.append(value)) or True
-    )
-    assert len(seen) == 2

@@ -175,7 +175,7 @@ def test_the_text_of_the_error_lists_file_line_path_and_count(tmp_path):
         (
             "preset: paper",
             "preset: papers",
-            "expected structured or paper, found text 'papers'; did you mean",
+            "expected structured, terms or paper, found text 'papers'; did you mean",
         ),
         ("[alpha_dot^2, i*alpha]", "[]", "expected at least 1 entry, found an empty list"),
         ("record: [", "record: [2, ", "expected text, found 2"),

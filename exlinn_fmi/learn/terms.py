@@ -1,0 +1,182 @@
+"""The learner `terms`: a short sum of physical terms, found by the objective that the data call for.
+
+``inverse`` and ``weak`` are linear least squares; ``trajectory`` is maximum likelihood by multiple shooting
+(`discover`). All prune the generic terms by the same criterion, and all give each coefficient its standard
+deviation, which goes into the model's provenance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from exlinn_fmi.data.dataset import Dataset
+from exlinn_fmi.learn.basis import entry, generic_basis
+from exlinn_fmi.learn.discover import Discovery, discover, least_mass, prune, spread
+from exlinn_fmi.learn.iterate import Iterate
+from exlinn_fmi.learn.noise import CLEAN, relative_noise
+from exlinn_fmi.learn.trajectory import Fit, Information, Shooting, cut
+from exlinn_fmi.learn.weak import OVERLAP, Regression, inverse_regression, weak_regression
+from exlinn_fmi.mechanics.learned import ModelSpec
+from exlinn_fmi.mechanics.monomials import MonomialBasis
+from exlinn_fmi.scenario.schema import Objective, Terms
+
+Array = NDArray[np.float64]
+
+STAGES = 5
+"""About as many iterates does the learner give."""
+CONSISTENT = 1e-4
+"""Accelerations that leave no more than this share of the forces unexplained were measured, or as good as."""
+LEAST_MISFIT = 1e-6
+"""Terms are judged as if forces had at least this noise, as a share of their size."""
+
+
+def terms_spec(train: Dataset, options: Terms) -> ModelSpec:
+    """The model to train: the user's candidates, or generic ones."""
+    if options.lagrangian:
+        basis = MonomialBasis(train.coordinates, tuple(options.lagrangian), tuple(options.dissipation))
+    else:
+        basis = generic_basis(train)
+    return ModelSpec(
+        "terms",
+        train.coordinates,
+        0,
+        lagrangian_features=basis.lagrangian,
+        dissipation_features=basis.dissipation,
+    )
+
+
+def choose(objective: Objective, basis: MonomialBasis, data: Dataset) -> tuple[Objective, str]:
+    """What to make small, and why.
+
+    Args:
+        objective: what the user chose; ``auto`` leaves it to the data.
+        basis: a family that can explain the data.
+        data: what it is fitted to.
+    """
+    if objective != "auto":
+        return objective, f"{objective}: as the scenario says"
+    noise = relative_noise(data)
+    worst = max(noise, key=lambda name: noise[name])
+    if noise[worst] > CLEAN:
+        return (
+            "trajectory",
+            f"trajectory: {worst} has {100 * noise[worst]:.2g} % noise, the most of all states",
+        )
+    regression = inverse_regression(basis, data)
+    misfit = regression.misfit(regression.solve())
+    if misfit > CONSISTENT:
+        return (
+            "trajectory",
+            f"trajectory: states are clean, but {100 * misfit:.2g} % of forces do not fit the accelerations",
+        )
+    return "inverse", "inverse: the states are clean and the accelerations agree with them"
+
+
+def iterate_terms(
+    spec: ModelSpec, train: Dataset, validation: Dataset, objective: Objective
+) -> Iterator[Iterate]:
+    """Train; yields after each stage of the work.
+
+    Args:
+        spec: from `terms_spec`.
+        train: data to fit.
+        validation: data to watch.
+        objective: what to make small.
+    """
+    basis = MonomialBasis(spec.coordinates, spec.lagrangian_features, spec.dissipation_features)
+    chosen, why = choose(objective, basis, train)
+    found = discover(basis, train) if chosen == "trajectory" else _regress(basis, train, chosen)
+    for step, now in enumerate(found):
+        p, count = now.p, len(basis.lagrangian)
+        yield Iterate(
+            {"lagrangian.terms": p[:count], "dissipation.terms": p[count:]},
+            prediction_error(basis, p, train),
+            prediction_error(basis, p, validation),
+            now.stage,
+            least_mass(basis, p, train) > 0,
+            step,
+            _notes(basis, now, why, train),
+        )
+
+
+def _regress(basis: MonomialBasis, data: Dataset, objective: Objective) -> Iterator[Discovery]:
+    """Least squares on all terms, and on those that pruning leaves."""
+    weak = objective == "weak"
+    regression = (weak_regression if weak else inverse_regression)(basis, data)
+    windows = OVERLAP if weak else 1  # that share samples, and so count as one
+    chosen = np.ones(basis.size, dtype=bool)
+    fit = _linear_fit(regression, windows, LEAST_MISFIT)
+    yield Discovery("all terms", chosen, fit)
+    chosen = prune(fit, regression.force.size / windows, basis.size)
+    part = Regression(regression.columns[:, :, chosen], regression.force)
+    yield Discovery("least squares", chosen, _linear_fit(part, windows, 0.0))
+
+
+def _linear_fit(regression: Regression, windows: int, least: float) -> Fit:
+    """Least squares with covariance from its residuals."""
+    p = regression.solve()
+    flat = regression.columns.reshape(-1, len(p))
+    force = np.sqrt(np.mean(regression.force**2))
+    sigma = max(regression.misfit(p), least, np.finfo(float).eps) * force
+    value = float(np.sum((flat @ p - regression.force.ravel()) ** 2) / sigma**2)
+    return Fit(p, np.zeros((0, 0)), value, Information(flat.T @ flat / (windows * sigma**2)), np.zeros(0))
+
+
+def prediction_error(basis: MonomialBasis, p: Float[Array, " P"], data: Dataset) -> float:
+    """Mean square error of states predicted over a segment, relative to their variance.
+
+    Args:
+        basis: the family.
+        p: its coefficients.
+        data: trajectories; the segments start as measured.
+    """
+    kept = p != 0
+    system = basis.only(kept).system()
+    size = data.frame[system.state_names].std().to_numpy()
+    segments = replace(cut(data, system.state_names, system.input_names), sigma=np.where(size > 0, size, 1))
+    return Shooting(system, segments).misprediction(p[kept]) / (segments.total * len(size))
+
+
+def _notes(basis: MonomialBasis, found: Discovery, why: str, data: Dataset) -> dict[str, Any]:
+    """Provenance: the objective and its reason, noise, and the terms with their deviations."""
+    deviation = spread(np.sqrt(np.diag(found.fit.information.covariance)), found.chosen)
+    return {"objective": why, "noise": relative_noise(data), "deviations": deviation.tolist()}
+
+
+def term_table(spec: ModelSpec, p: Float[Array, " P"], deviations: Float[Array, " P"]) -> pd.DataFrame:
+    """The terms found: where they stand, their function, coefficient, deviation and 95 % interval.
+
+    Args:
+        spec: of the form ``terms``.
+        p: coefficients of 𝓛's terms, then of D's.
+        deviations: their standard deviations.
+    """
+    rows: list[tuple[Any, ...]] = []
+    texts = (*spec.lagrangian_features, *spec.dissipation_features)
+    for k in np.flatnonzero(p):
+        if k < len(spec.lagrangian_features):
+            place, function, factor = entry(texts[k], spec.coordinates)
+        else:
+            place, function, factor = "D", texts[k], 1.0
+        value, std = factor * p[k], abs(factor) * deviations[k]
+        rows.append((place, function or "1", value, std, value - 1.96 * std, value + 1.96 * std, texts[k]))
+    return pd.DataFrame(rows, columns=["entry", "function", "coefficient", "std", "low", "high", "term"])
+
+
+def formula(table: pd.DataFrame) -> str:
+    """The terms in one line: M_11 = 0.1 + 0.04 sin(alpha)^2; A_2 = 1 alpha; D = …."""
+    parts = []
+    for place, rows in table.groupby("entry", sort=False):
+        terms = [
+            f"{c:.6g}" if f == "1" else f"{c:.6g}*{f}"
+            for c, f in zip(rows["coefficient"], rows["function"], strict=True)
+        ]
+        parts.append(f"{place} = {' + '.join(terms).replace('+ -', '- ')}")
+    return "; ".join(parts)
