@@ -89,7 +89,10 @@ def load_scenario(
     if overrides and isinstance(data, dict) and not problems:
         text, applied, misfits = apply(text, overrides)
         problems += misfits
-        data = parse(text).data
+        overridden = parse(text)
+        data = overridden.data
+        # Lines of this text are not those of the file.
+        problems += [Problem(p.path, f"{p.message} (after the overrides)") for p in overridden.problems]
     if data is not None:
         findings = schema_findings(data, document.faulty)
         known, more = survey(data, file.parent, inspect)
