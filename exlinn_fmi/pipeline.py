@@ -102,13 +102,16 @@ def train(work: Run) -> None:
 
     began, tests = time.perf_counter(), dataset.tests
     part, validation = split(dataset.training, learn.train_fraction, learn.split_blocks, seed)
-    model = fit(part, validation, learn.method, seed, show, work.stop)
+    model = fit(part, validation, learn.method, seed, show, work.stop, learn.objective)
     written = save_model(work.folder, model)
-    card = report_card(model, part, tests, learn.identify, truth(work))
+    card = report_card(model, part, tests, learn.identify, truth(work), learn.objective)
     written += write_table(work.folder / "evaluation", card.evaluation, card.units)
     parameters = work.folder / "parameters.csv"
     write_text(parameters, card.parameters.to_csv(index=False))
-    work.replace_metrics(("learn.", "identify."), card.metrics)
+    if card.terms is not None:
+        written.append(work.folder / "terms.csv")
+        write_text(written[-1], card.terms.to_csv(index=False))
+    work.replace_metrics(("learn.", "identify."), card.metrics | card.texts)
     if work.stop.take():
         # The stage is not recorded as done: the next run trains again.
         work.warn("training was stopped: the best weights so far are used; the next run trains to the end")

@@ -7,7 +7,7 @@ velocities by free runs of the forward model; physical parameters beside the pla
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
@@ -15,11 +15,14 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
+from exlinn_fmi.learn.estimate import estimate
 from exlinn_fmi.learn.identify import Identified, identify
+from exlinn_fmi.learn.noise import CLEAN, relative_noise
 from exlinn_fmi.learn.rollout import free_run, nrmse
+from exlinn_fmi.learn.terms import formula, term_table
 from exlinn_fmi.learn.train import TrainedModel
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
-from exlinn_fmi.scenario.schema import Identify
+from exlinn_fmi.scenario.schema import Identify, Objective
 
 Array = NDArray[np.float64]
 
@@ -34,20 +37,31 @@ class ReportCard:
 
     Args:
         metrics: ``learn.…`` and ``identify.…`` by name; NaN where there is nothing to judge by.
-        parameters: columns name, identified, true, rel_error.
+        parameters: columns name, identified, true, rel_error; std, low and high (95 % interval) where the
+            parameters were fitted to the data themselves.
         evaluation: on the first test: time, and each quantity measured (``name``) and learned
             (``name_learned``).
         units: units of the evaluation's columns.
+        texts: ``learn.objective``, ``learn.terms`` and ``identify.objective``: what was done and why, and the
+            formula that was found, as far as there is any.
+        terms: the terms that were found, if the model is made of such.
     """
 
     metrics: dict[str, float]
     parameters: pd.DataFrame
     evaluation: pd.DataFrame
     units: dict[str, str]
+    texts: dict[str, str] = field(default_factory=dict)
+    terms: pd.DataFrame | None = None
 
 
 def report_card(
-    model: TrainedModel, train: Dataset, tests: list[Dataset], options: Identify, truth: Mapping[str, float]
+    model: TrainedModel,
+    train: Dataset,
+    tests: list[Dataset],
+    options: Identify,
+    truth: Mapping[str, float],
+    objective: Objective = "auto",
 ) -> ReportCard:
     """Judge a model.
 
@@ -57,6 +71,7 @@ def report_card(
         tests: data that training never saw, one trajectory each; the first is the unseen test of forces.
         options: parameters to read off.
         truth: parameters of the plant as far as they are known.
+        objective: what the estimate of the parameters makes small.
 
     Raises:
         ModelError: a monomial of `options` cannot be read.
@@ -69,9 +84,20 @@ def report_card(
         "learn.mass_matrix_min_eigenvalue": min(_least_mass(system, d) for d in (tests or [train])),
         "learn.seconds": model.seconds,
     }
-    found = identify(system, train, options, truth)
+    noise = relative_noise(train)
+    metrics |= {f"learn.noise_{name}": value for name, value in noise.items()}
+    found, texts = None, {}
+    if (options.lagrangian or options.dissipation) and (objective != "auto" or max(noise.values()) > CLEAN):
+        found, texts["identify.objective"] = estimate(train, options, truth, objective)
+    found = found or identify(system, train, options, truth)
+    terms = None
+    if model.spec.form == "terms":
+        coefficients = np.concatenate([model.weights["lagrangian.terms"], model.weights["dissipation.terms"]])
+        terms = term_table(model.spec, coefficients, np.array(model.provenance["deviations"]))
+        texts |= {"learn.objective": model.provenance["objective"], "learn.terms": formula(terms)}
     evaluation, units = _evaluation(system, (tests or [train])[0])
-    return ReportCard(metrics | _identify_metrics(found), found.parameters, evaluation, units)
+    metrics |= _identify_metrics(found)
+    return ReportCard(metrics, found.parameters, evaluation, units, texts, terms)
 
 
 def force_error(system: LagrangianSystem, data: Dataset) -> Float[Array, "N n"]:
@@ -134,6 +160,8 @@ def _identify_metrics(found: Identified) -> dict[str, float]:
     metrics = {"identify.max_rel_error": float(worst), "identify.misfit": found.misfit}
     for name, value, error in zip(table["name"], table["identified"], table["rel_error"], strict=True):
         metrics |= {f"identify.{name}": float(value), f"identify.{name}_rel_error": float(error)}
+    if "std" in table:
+        metrics |= {f"identify.{n}_std": float(s) for n, s in zip(table["name"], table["std"], strict=True)}
     return metrics
 
 

@@ -60,7 +60,7 @@ def identify(
     """
     names = [*options.lagrangian, *options.dissipation]
     if not names:
-        return Identified(_table([], np.empty(0), truth), float("nan"))
+        return Identified(parameter_table([], np.empty(0), truth), float("nan"))
     basis = MonomialBasis(
         system.coordinates, tuple(options.lagrangian.values()), tuple(options.dissipation.values())
     )
@@ -73,7 +73,7 @@ def identify(
     weight = 1 / np.maximum(np.sqrt(np.mean(force**2, axis=0)), np.finfo(float).tiny)
     matrix = evaluate(basis.regressor(), q, v, a).reshape(*v.shape, len(names)) * weight[:, None]
     values, misfit = _solve(matrix.reshape(-1, len(names)), (force * weight).ravel())
-    return Identified(_table(names, values, truth), misfit)
+    return Identified(parameter_table(names, values, truth), misfit)
 
 
 def _solve(matrix: Float[Array, "N K"], right: Float[Array, " N"]) -> tuple[Float[Array, " K"], float]:
@@ -90,7 +90,7 @@ def _solve(matrix: Float[Array, "N K"], right: Float[Array, " N"]) -> tuple[Floa
     return values, float(np.linalg.norm(rest) / np.linalg.norm(right))
 
 
-def _table(names: list[str], values: Float[Array, " K"], truth: Mapping[str, float]) -> pd.DataFrame:
+def parameter_table(names: list[str], values: Float[Array, " K"], truth: Mapping[str, float]) -> pd.DataFrame:
     """The parameters beside their true values."""
     true = np.array([true_value(name, truth) for name in names], dtype=float)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -21,7 +21,7 @@ from exlinn_fmi.learn.basis import entry, generic_basis
 from exlinn_fmi.learn.discover import Discovery, discover, least_mass, prune, spread
 from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.learn.noise import CLEAN, relative_noise
-from exlinn_fmi.learn.trajectory import Fit, Information, Shooting, cut
+from exlinn_fmi.learn.trajectory import Fit, Information, Shooting, cut, even
 from exlinn_fmi.learn.weak import OVERLAP, Regression, inverse_regression, weak_regression
 from exlinn_fmi.mechanics.learned import ModelSpec
 from exlinn_fmi.mechanics.monomials import MonomialBasis
@@ -64,6 +64,10 @@ def choose(objective: Objective, basis: MonomialBasis, data: Dataset) -> tuple[O
         return objective, f"{objective}: as the scenario says"
     noise = relative_noise(data)
     worst = max(noise, key=lambda name: noise[name])
+    if not even(data):
+        if noise[worst] > CLEAN:
+            return "weak", f"weak: {worst} has {100 * noise[worst]:.2g} % noise, but steps differ in length"
+        return "inverse", "inverse: the states are clean and steps differ in length"
     if noise[worst] > CLEAN:
         return (
             "trajectory",
@@ -92,13 +96,14 @@ def iterate_terms(
     """
     basis = MonomialBasis(spec.coordinates, spec.lagrangian_features, spec.dissipation_features)
     chosen, why = choose(objective, basis, train)
-    found = discover(basis, train) if chosen == "trajectory" else _regress(basis, train, chosen)
+    found = discover(basis, train) if chosen == "trajectory" else _least_squares(basis, train, chosen)
+    judge = prediction_error if chosen == "trajectory" else force_misfit
     for step, now in enumerate(found):
         p, count = now.p, len(basis.lagrangian)
         yield Iterate(
             {"lagrangian.terms": p[:count], "dissipation.terms": p[count:]},
-            prediction_error(basis, p, train),
-            prediction_error(basis, p, validation),
+            judge(basis, p, train),
+            judge(basis, p, validation),
             now.stage,
             least_mass(basis, p, train) > 0,
             step,
@@ -106,27 +111,43 @@ def iterate_terms(
         )
 
 
-def _regress(basis: MonomialBasis, data: Dataset, objective: Objective) -> Iterator[Discovery]:
+def _least_squares(basis: MonomialBasis, data: Dataset, objective: Objective) -> Iterator[Discovery]:
     """Least squares on all terms, and on those that pruning leaves."""
-    weak = objective == "weak"
-    regression = (weak_regression if weak else inverse_regression)(basis, data)
-    windows = OVERLAP if weak else 1  # that share samples, and so count as one
+    regression, windows = regress(basis, data, objective)
     chosen = np.ones(basis.size, dtype=bool)
-    fit = _linear_fit(regression, windows, LEAST_MISFIT)
+    fit = linear_fit(regression, windows, LEAST_MISFIT)
     yield Discovery("all terms", chosen, fit)
     chosen = prune(fit, regression.force.size / windows, basis.size)
     part = Regression(regression.columns[:, :, chosen], regression.force)
-    yield Discovery("least squares", chosen, _linear_fit(part, windows, 0.0))
+    yield Discovery("least squares", chosen, linear_fit(part, windows))
 
 
-def _linear_fit(regression: Regression, windows: int, least: float) -> Fit:
-    """Least squares with covariance from its residuals."""
+def regress(basis: MonomialBasis, data: Dataset, objective: Objective) -> tuple[Regression, int]:
+    """The linear problem of ``inverse`` or ``weak``, and how many rows share samples, and so count as one."""
+    if objective == "weak":
+        return weak_regression(basis, data), OVERLAP
+    return inverse_regression(basis, data), 1
+
+
+def linear_fit(regression: Regression, windows: int, least: float = 0.0) -> Fit:
+    """Least squares with covariance from its residuals.
+
+    Args:
+        regression: the linear problem.
+        windows: how many of its rows count as one.
+        least: smallest noise of the forces, as a share of their size.
+    """
     p = regression.solve()
     flat = regression.columns.reshape(-1, len(p))
     force = np.sqrt(np.mean(regression.force**2))
     sigma = max(regression.misfit(p), least, np.finfo(float).eps) * force
     value = float(np.sum((flat @ p - regression.force.ravel()) ** 2) / sigma**2)
     return Fit(p, np.zeros((0, 0)), value, Information(flat.T @ flat / (windows * sigma**2)), np.zeros(0))
+
+
+def force_misfit(basis: MonomialBasis, p: Float[Array, " P"], data: Dataset) -> float:
+    """Square of the share of the forces that the inverse model (17) leaves unexplained."""
+    return inverse_regression(basis, data).misfit(p) ** 2
 
 
 def prediction_error(basis: MonomialBasis, p: Float[Array, " P"], data: Dataset) -> float:

@@ -68,6 +68,14 @@ class Segments:
         return float(self.counted.sum())
 
 
+def even(data: Dataset) -> bool:
+    """Whether all steps have one length, as fits to trajectories need."""
+    steps = np.concatenate(
+        [np.diff(part["time"].to_numpy(dtype=float)) for _, part in data.frame.groupby("trajectory")]
+    )
+    return bool(np.abs(steps - np.median(steps)).max() <= EVEN * np.median(steps))
+
+
 def cut(data: Dataset, states: list[str], inputs: list[str], every: int = 1) -> Segments:
     """Cut a data set into segments.
 
@@ -83,7 +91,7 @@ def cut(data: Dataset, states: list[str], inputs: list[str], every: int = 1) -> 
     frames = [part for _, part in data.frame.groupby("trajectory", sort=False) if len(part) > every]
     steps = np.concatenate([np.diff(part["time"].to_numpy(dtype=float)) for part in frames])
     step = float(np.median(steps))
-    if np.abs(steps - step).max() > EVEN * step:
+    if not even(data):
         raise DataError(
             f"data set: steps of {steps.min():.6g} s to {steps.max():.6g} s, expected one step throughout to "
             "fit to trajectories; resample the data, or choose the objective 'inverse'"

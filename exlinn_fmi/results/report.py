@@ -116,7 +116,7 @@ def _metrics(run: RunFiles) -> str:
     """All metrics by group, in plain words beside their keys."""
     html: list[tuple[str, str, str]] = []
     names: Iterable[str] = () if run.parameters is None else run.parameters["name"]
-    listed = {f"identify.{name}{suffix}" for name in names for suffix in ("", "_rel_error")}
+    listed = {f"identify.{name}{suffix}" for name in names for suffix in ("", "_std", "_rel_error")}
     keys = [key for key in run.metrics if key not in listed]  # the parameters have a table of their own
     groups = dict.fromkeys((*GROUPS, *(key.split(".")[0] for key in keys)))
     for group in groups:
@@ -147,9 +147,19 @@ def _parameters(parameters: pd.DataFrame | None) -> str:
     """Identified physical parameters beside their true values, where those are known."""
     if parameters is None:
         return ""
-    known = [c for c in ("name", "identified", "true", "rel_error", "unit") if c in parameters.columns]
-    titles = {"name": "parameter", "rel_error": "relative error"}
-    digits = {"identified": 7, "true": 7, "rel_error": 2}
+    known = [
+        c
+        for c in ("name", "identified", "std", "low", "high", "true", "rel_error", "unit")
+        if c in parameters.columns
+    ]
+    titles = {
+        "name": "parameter",
+        "std": "standard deviation",
+        "low": "95 % from",
+        "high": "to",
+        "rel_error": "relative error",
+    }
+    digits = {"identified": 7, "std": 2, "low": 6, "high": 6, "true": 7, "rel_error": 2}
     rows = [
         [
             number(float(cell), digits[column]) if column in digits else escape(str(cell))

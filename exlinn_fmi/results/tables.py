@@ -52,7 +52,7 @@ class RunFiles:
         training: loss over iterations.
         parameters: identified parameters with their true values.
         trajectories: what the co-simulation recorded.
-        metrics: value by flat key, None where it was not finite.
+        metrics: value (or text) by flat key, None where it was not finite.
         provenance: what `provenance` gave.
     """
 
@@ -63,7 +63,7 @@ class RunFiles:
     training: pd.DataFrame | None = None
     parameters: pd.DataFrame | None = None
     trajectories: Table | None = None
-    metrics: Mapping[str, float | None] = field(default_factory=dict)
+    metrics: Mapping[str, float | str | None] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
 

@@ -28,9 +28,14 @@ WORDING = (
     (r"learn\.rollout_diverged", "Free runs diverged (1) or stayed finite (0)", ""),
     (r"learn\.mass_matrix_min_eigenvalue", "Smallest eigenvalue of the mass matrix", ""),
     (r"learn\.seconds", "Time of training", "s"),
+    (r"learn\.noise_(.+)", "Noise of {0}, relative to the signal", ""),
+    (r"learn\.objective", "What was made small, and why", ""),
+    (r"learn\.terms", "Terms found", ""),
+    (r"identify\.objective", "How the parameters were found, and why", ""),
     (r"identify\.max_rel_error", "Largest relative error of an identified parameter", ""),
     (r"identify\.misfit", "What the identified parameters leave unexplained", ""),
     (r"identify\.(.+)_rel_error", "Relative error of {0}", ""),
+    (r"identify\.(.+)_std", "Standard deviation of {0}", ""),
     (r"identify\.(.+)", "Identified {0}", ""),
     (r"control\.violations", "Recorded values outside their bounds", ""),
     (r"control\.solve_ms_median", "Time of a solve, median", "ms"),
@@ -103,6 +108,8 @@ def value(run: RunFiles, key: str) -> str:
     if metric is None:
         diverged = key.startswith("learn.rollout") and run.metrics.get("learn.rollout_diverged")
         return "diverged" if diverged else NO_VALUE
+    if isinstance(metric, str):
+        return escape(metric)
     factor, multiple = readable(abs(metric), unit) if unit else (1.0, "")
     shown = f"{number(metric * factor, 3)} {typeset(multiple)}".strip()
     return f'<span title="{escape(f"{metric!r} {unit}".strip())}">{escape(shown)}</span>'
