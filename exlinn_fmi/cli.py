@@ -160,6 +160,22 @@ def train(scenario: ScenarioFile, out: Out = None, overrides: Overrides = None) 
 
 
 @app.command()
+def design(scenario: ScenarioFile, out: Out = None, overrides: Overrides = None) -> None:
+    """Propose an excitation that tells most of the parameter known worst. Ctrl-C keeps the best so far.
+
+    Counts on the plant's formulas, or on the model that `exlinn train` learned, and on the sensors' noise
+    and the limits in `learn.design`.
+
+    Example: exlinn design scenarios/dcwc_tracking.yaml --set learn.design.limits.states.i='{min: -4, max: 4}'
+    """
+    from exlinn_fmi import pipeline
+    from exlinn_fmi.designing import summary
+
+    work = perform(pipeline.design, scenario, out, overrides)
+    typer.echo(summary(work.folder))
+
+
+@app.command()
 def simulate(scenario: ScenarioFile, out: Out = None, overrides: Overrides = None) -> None:
     """Run the scenario's components in co-simulation (learning first what they need).
 

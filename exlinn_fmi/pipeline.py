@@ -88,7 +88,8 @@ def train(work: Run) -> None:
         RunError: no usable model came of it.
     """
     learn, dataset, seed = work.learn, collect(work), work.seed
-    key = fingerprint(learn, seed, truth(work), work.stages.key("collect"))
+    settings = learn.model_dump(mode="json", exclude={"design"})  # which looks at what is learned here
+    key = fingerprint(settings, seed, truth(work), work.stages.key("collect"))
     if work.unchanged("train", key, f"preset {learn.method.preset}"):
         return
     from exlinn_fmi.data.dataset import split
@@ -118,6 +119,30 @@ def train(work: Run) -> None:
         work.noted("train", "interrupted", None)
     else:
         work.done("train", key, [*written, parameters], began)
+
+
+def design(work: Run) -> None:
+    """Propose an excitation that tells most of the parameter known worst; save it to paste into the scenario.
+
+    Raises:
+        InputError: there is no model to count on, or no excitation keeps the limits.
+    """
+    from exlinn_fmi.designing import model_files, propose
+
+    learn = work.learn
+    key = fingerprint(learn, work.seed, truth(work), files=[*work.files(learn), *model_files(work)])
+    if work.unchanged("design", key, f"excitation for {len(learn.identify.names)} parameters"):
+        return
+    began = time.perf_counter()
+    try:
+        written = propose(work, truth(work))
+    except ExlinnError as error:
+        raise work.failed("design", error) from None
+    if work.stop.take():
+        work.warn("the search was stopped: the best excitation so far is proposed; run it again to search on")
+        work.noted("design", "interrupted", None)
+    else:
+        work.done("design", key, written, began)
 
 
 def simulate(work: Run) -> None:

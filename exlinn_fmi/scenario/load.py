@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from exlinn_fmi.errors import Problem, ScenarioError
-from exlinn_fmi.scenario import check_data, check_graph, check_learn
+from exlinn_fmi.scenario import check_data, check_design, check_graph, check_learn
 from exlinn_fmi.scenario.document import Document, parse
 from exlinn_fmi.scenario.editor import json_schema
 from exlinn_fmi.scenario.explain import Finding, schema_findings
@@ -40,6 +40,7 @@ CHECKS = (
     check_learn.learning,
     check_learn.control,
     check_data.measured,
+    check_design.design,
 )
 
 

@@ -507,6 +507,11 @@ class Identify(Spec):
         default_factory=dict, description="parameter: monomial of D, e.g. r: 0.5*i^2"
     )
 
+    @property
+    def names(self) -> list[str]:
+        """All parameters, those of 𝓛 first."""
+        return [*self.lagrangian, *self.dissipation]
+
 
 class Learn(Spec):
     """What the learning of a model takes, wherever the data come from."""
@@ -541,6 +546,12 @@ NoiseLevel = Annotated[
 ]
 
 
+Sensors = Annotated[
+    Annotated[Positive, Tag("a number")] | Annotated[dict[str, NoiseLevel], Tag("a mapping")],
+    Discriminator(form),
+]
+
+
 class Limits(Spec):
     """What an experiment must not exceed."""
 
@@ -554,24 +565,25 @@ class Limits(Spec):
 class Design(Spec):
     """What `exlinn design` counts on when it looks for a better excitation."""
 
-    noise: (
-        Annotated[Positive, Tag("a number")] | Annotated[dict[str, NoiseLevel], Tag("a mapping")]
-    ) = Field(
+    noise: Sensors = Field(
         0.01,
-        description="noise of the measured states: a share of each signal's standard deviation in the present "
-        "training, or by name a share or {std: …}; those not named are not measured",
-        discriminator=Discriminator(form),
+        description="noise of the measured states: a share of each signal's standard deviation in the "
+        "present training, or by name a share or {std: …}; those not named are not measured",
     )
-    limits: Limits = Field(default_factory=lambda: Limits(), description="what the experiment must not exceed")
+    limits: Limits = Field(
+        default_factory=lambda: Limits(), description="what the experiment must not exceed"
+    )
     duration: Positive | None = Field(
         None, description="duration of the experiment [s]; that of the present training if not given"
     )
-    band: Band | None = Field(None, description="frequencies that may be used [Hz]; from the model if not given")
+    band: Band | None = Field(
+        None, description="frequencies that may be used [Hz]; from the model if not given"
+    )
     candidates: int = Field(200, ge=10, le=100_000, description="multisines that are tried before refining")
     model: str | None = Field(
         None,
-        description="`learned`, `plant:NAME` or a folder with model.json; if not given the plant itself where it "
-        "is one of ours, else what `exlinn train` learned",
+        description="`learned`, `plant:NAME` or a folder with model.json; if not given the plant itself "
+        "where it is one of ours, else what `exlinn train` learned",
     )
 
 
