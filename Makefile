@@ -38,7 +38,7 @@ bench: .venv/.bench
 	touch $@
 
 .venv/.dev: .venv/.user
-	$(INSTALL) -e '.[dev]'
+	$(INSTALL) -e '.[dev,bench]'
 	touch $@
 
 .venv/.bench: .venv/.dev
