@@ -151,21 +151,21 @@ def _family(work: Run, learn: LearnFromPlant, truth: Mapping[str, float]) -> Lag
 def _parameters(
     work: Run, learn: LearnFromPlant, stated: Mapping[str, float], learned: bool
 ) -> tuple[Parameter, ...]:
-    """The parameters to find: as identified where the model was learned, else as stated."""
+    """The parameters to find: as identified first where the model was learned, else as stated first."""
     import pandas as pd
 
     from exlinn_fmi.learn.identify import true_value
     from exlinn_fmi.mechanics.coordinates import Parameter
 
-    identified: dict[str, float] = {}
-    if learned and (work.folder / "parameters.csv").exists():
+    found: dict[str, float] = {}
+    if (work.folder / "parameters.csv").exists():
         table = pd.read_csv(work.folder / "parameters.csv")
-        identified = dict(zip(table["name"], table["identified"], strict=True))
+        found = dict(zip(table["name"], table["identified"], strict=True))
     result = []
     for name in learn.identify.names:
-        value = identified.get(name, float("nan"))
-        value = true_value(name, stated) if np.isnan(value) else value
-        if not np.isfinite(value) or value == 0:
+        known = found.get(name, float("nan")), true_value(name, stated)
+        value = next((x for x in (known if learned else known[::-1]) if np.isfinite(x)), 0.0)
+        if value == 0:
             raise InputError(
                 f"{work.loaded.file}: learn.identify: no value of {name!r} is known to improve on: the plant "
                 "states none, and training identified none; run `exlinn train` with it first, or take it out"
