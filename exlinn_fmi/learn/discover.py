@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
+from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.trajectory import Fit, Information, Segments, Shooting, cut, maximum_likelihood
 from exlinn_fmi.learn.weak import inverse_regression, weak_regression
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
@@ -90,6 +91,9 @@ def start(basis: MonomialBasis, data: Dataset, segments: Segments) -> Float[Arra
         basis: the family.
         data: trajectories.
         segments: the same, cut.
+
+    Raises:
+        TrainingError: none of them predicts anything.
     """
     orders = np.array([_order(text, basis) for text in basis.terms])
     shooting = Shooting(basis.system(), segments)
@@ -103,6 +107,11 @@ def start(basis: MonomialBasis, data: Dataset, segments: Segments) -> Float[Arra
                 p = spread(part.solve(ridge), chosen)
                 if least_mass(basis, p, data) > LEAST_MASS and (error := shooting.misprediction(p)) < least:
                     best, least = p, error
+    if not np.isfinite(least):
+        raise TrainingError(
+            "no combination of these terms has a positive definite mass matrix and predicts the data at all; "
+            "give terms that fit the plant, more or richer data, or choose the preset 'structured'"
+        )
     return best
 
 

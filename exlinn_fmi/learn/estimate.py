@@ -16,6 +16,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
+from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.discover import start
 from exlinn_fmi.learn.identify import PART, Identified, parameter_table
 from exlinn_fmi.learn.noise import CLEAN
@@ -64,7 +65,10 @@ def estimate(data: Dataset, options: Identify, truth: Mapping[str, float], objec
     if chosen == "trajectory":
         system = basis.system()
         segments = cut(data, system.state_names, system.input_names)
-        fit = maximum_likelihood(system, segments, start(basis, data, segments))
+        try:
+            fit = maximum_likelihood(system, segments, start(basis, data, segments))
+        except TrainingError:
+            return Estimate(None, "read off the learned model: the monomials alone predict nothing")
         size = data.frame[system.state_names].std().to_numpy()
         excess = float((fit.sigma / np.maximum(segments.sigma, CLEAN * size)).max())
         if not excess <= EXPLAINED:

@@ -33,6 +33,8 @@ STAGES = 5
 """About as many iterates does the learner give."""
 CONSISTENT = 1e-4
 """Accelerations that leave no more than this share of the forces unexplained were measured, or as good as."""
+BETTER = 0.1
+"""If not, and the weak form leaves less than this share of that, the accelerations are not to be trusted."""
 LEAST_MISFIT = 1e-6
 """Terms are judged as if forces had at least this noise, as a share of their size."""
 
@@ -75,12 +77,14 @@ def choose(objective: Objective, basis: MonomialBasis, data: Dataset) -> tuple[O
         )
     regression = inverse_regression(basis, data)
     misfit = regression.misfit(regression.solve())
-    if misfit > CONSISTENT:
+    weak = weak_regression(basis, data)
+    # Where neither fits it is the terms that fall short: no objective mends that.
+    if misfit > CONSISTENT and weak.misfit(weak.solve()) < BETTER * misfit:
         return (
             "trajectory",
             f"trajectory: states are clean, but {100 * misfit:.2g} % of forces do not fit the accelerations",
         )
-    return "inverse", "inverse: the states are clean and the accelerations agree with them"
+    return "inverse", "inverse: the states are clean and the accelerations do not contradict them"
 
 
 def iterate_terms(

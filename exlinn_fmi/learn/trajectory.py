@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from exlinn_fmi.data.dataset import Dataset
-from exlinn_fmi.errors import DataError
+from exlinn_fmi.errors import DataError, TrainingError
 from exlinn_fmi.learn.levenberg import Normal, levenberg_marquardt
 from exlinn_fmi.learn.noise import FLOOR, noise_levels
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
@@ -258,7 +258,13 @@ class Shooting:
     def information(self, theta: Float[Array, " T"]) -> Information:
         """What the data tell of p at θ."""
         matrix, r = self.normal(theta).matrix, len(self.system.parameters)
-        cross = np.linalg.solve(matrix[r:, r:], matrix[r:, :r])
+        try:
+            cross = np.linalg.solve(matrix[r:, r:], matrix[r:, :r])
+        except np.linalg.LinAlgError as error:
+            raise TrainingError(
+                "the fitted model says nothing of the measured states: its sensitivities vanish; check units "
+                "and columns of the data, or choose the objective 'inverse'"
+            ) from error
         return Information(matrix[:r, :r] - matrix[:r, r:] @ cross)
 
     def noise(self, theta: Float[Array, " T"]) -> Float[Array, " nx"]:

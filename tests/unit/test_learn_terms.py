@@ -9,6 +9,7 @@ from learn_helpers import simulate
 from test_learn_noise_trajectory import COORDINATES, FAMILY, STATES, TRUE, clean, noisy
 
 from exlinn_fmi.data.dataset import Dataset, split
+from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.basis import entry, generic_basis, position_functions, written
 from exlinn_fmi.learn.discover import discover, least_mass, prune, spread, start
 from exlinn_fmi.learn.terms import choose, formula, iterate_terms, term_table, terms_spec
@@ -146,6 +147,13 @@ def test_the_start_has_a_mass_matrix_whatever_the_noise() -> None:
     basis = candidates(data)
     p = start(basis, data, cut(data, STATES, ["v"]))
     assert least_mass(basis, p, data) > 0
+
+
+def test_terms_that_predict_nothing_are_refused_with_what_to_do() -> None:
+    basis = MonomialBasis(COORDINATES, ("0.5*i^2",), ("0.5*i^2",))
+    data = noisy(0.01)
+    with pytest.raises(TrainingError, match="mass matrix"):
+        start(basis, data, cut(data, STATES, ["v"]))
 
 
 def test_a_negative_mass_is_told() -> None:
