@@ -207,7 +207,9 @@ def _problem(
             f"{work.loaded.file}: learn.training: the model diverges under the present excitation, so that "
             "nothing can be said of it; train the model better, or choose `learn.design.model`"
         )
-    band = options.band or (1 / duration, min(max(problem.fastest, 20 * np.pi / duration), 0.1 / step))
+    # Up to twice the corner of the fastest pole, as far as sampling shows it, and a decade at least.
+    most = min(max(problem.fastest / np.pi, 10 / duration), 0.1 / step)
+    band = options.band or (1 / duration, max(most, 2 / duration))
     return replace(
         problem,
         sigma=_noise(learn, system, states.std(axis=0)),

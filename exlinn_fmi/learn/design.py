@@ -39,7 +39,7 @@ BATCH = 25
 """Candidates that are simulated at once."""
 FITTEST = 24
 """Best candidates that are refined, …"""
-GENERATIONS = 12
+GENERATIONS = 8
 """… for so many generations of differential evolution."""
 UNSEEN = 1e-12
 """Eigenvalues of the scaled information below this share of the largest tell of directions not seen."""
@@ -105,7 +105,7 @@ class Problem:
 
     def coarse(self) -> Problem:
         """The same with the longest step that still shows the motion; noise so that as much is told."""
-        step = max(self.step, min(0.1 / self.band[1], 0.2 / self.fastest))
+        step = max(self.step, min(0.1 / self.band[1], 0.5 / self.fastest))
         return replace(self, step=step, sigma=self.sigma * np.sqrt(self.step / step))
 
     @cached_property
