@@ -1,4 +1,4 @@
-"""How noisy.csv and noisy_test.csv were made: the motor with cart, 1 % noise on what trains, none on the test."""
+"""How noisy.csv and noisy_test.csv were made: the motor with cart, with 1 % noise and without."""
 
 from __future__ import annotations
 
