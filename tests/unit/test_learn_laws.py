@@ -247,4 +247,7 @@ def solenoid_judged(time: float, position: tuple[float, ...]) -> NDArray:
 
 @pytest.mark.parametrize("units", LENGTHS)
 def test_hidden_units_learn_alike_in_all_units_of_length(units: str) -> None:
-    np.testing.assert_allclose(solenoid_judged(*LENGTHS[units]), solenoid_judged(1.0, (1.0, 1.0)), rtol=1e-3)
+    # Free runs take internal steps of 1e-3 units of time at most: other units, other errors of integration.
+    here, there = solenoid_judged(1.0, (1.0, 1.0)), solenoid_judged(*LENGTHS[units])
+    np.testing.assert_allclose(there[0], here[0], rtol=1e-5)
+    np.testing.assert_allclose(there[1:], here[1:], rtol=1e-3, atol=1e-7)
