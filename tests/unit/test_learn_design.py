@@ -103,8 +103,8 @@ def test_a_proposal_keeps_all_limits_along_the_way() -> None:
     assert np.abs(states[0, :, 2]).max() <= 4
 
 
-def test_efficient_fits_scatter_as_predicted() -> None:
-    """Forty noisy recordings of the proposed experiment, each fitted by Gauss–Newton from the truth."""
+def test_linearised_fits_scatter_as_predicted() -> None:
+    """Forty noisy recordings of the proposed experiment, one Gauss–Newton step from the truth in each."""
     at, random = problem(), np.random.default_rng(0)
     states, inputs = at.simulate([proposal()])
     rows = np.stack(list(at.propagator.sensitivities(states, inputs, at.system.parameter_values)), axis=1)[0]
