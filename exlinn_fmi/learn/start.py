@@ -17,6 +17,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from exlinn_fmi.learn.assembly import Assembly, product_basis
+from exlinn_fmi.learn.factor import fit_factor
 from exlinn_fmi.learn.networks import coupling_columns
 from exlinn_fmi.mechanics.learned import Layout
 
@@ -36,8 +37,6 @@ NONE = 1e-6
 """Masses below this share of the forces in their equation are taken for none."""
 JOIN = 0.02
 """First weight of friction units, relative to the viscous one: small, so that they join without a jolt."""
-SPREAD = 1e-2
-"""Size of the columns of L that are drawn at random, relative to the others: columns of 0 would stay 0."""
 
 
 class Start(NamedTuple):
@@ -72,12 +71,8 @@ def linear_start(layout: Layout, data: Assembly, seed: int) -> Start:
     epsilon = np.zeros(len(found.forces))
     output = weights["lagrangian.output"]
     for block, columns in zip(layout.blocks, layout.columns, strict=True):
-        factor = np.zeros((len(block), columns, part.basis.shape[1]))
-        known = factor[:, : len(block)]
-        known[:], epsilon[block] = _factor(found.mass[:, block][:, :, block], found.forces[block], part.basis)
-        size = np.linalg.norm(known, axis=(1, 2))
-        drawn = random.standard_normal(factor[:, len(block) :].shape)
-        factor[:, len(block) :] = SPREAD * size[:, None, None] * drawn
+        mass, epsilon[block] = _mass_block(found.mass[:, block][:, :, block], found.forces[block])
+        factor = fit_factor(mass, part.basis, columns, random)
         for k, i in enumerate(block):
             output[layout.rows[i], : factor.shape[2]] = factor[k]
     for row, term in enumerate(layout.outputs):
@@ -127,10 +122,10 @@ def _solve(layout: Layout, part: Assembly) -> _Solution:
     return _Solution(functions, parts[-2], parts[-1], mass, forces)
 
 
-def _factor(
-    mass: Float[Array, "B m m"], forces: Float[Array, " m"], basis: Float[Array, "B nd"]
-) -> tuple[Float[Array, "m m nd"], Float[Array, " m"]]:
-    """Coefficients of the Cholesky factor of a block of M on the direct path, and ε.
+def _mass_block(
+    mass: Float[Array, "B m m"], forces: Float[Array, " m"]
+) -> tuple[Float[Array, "B m m"], Float[Array, " m"]]:
+    """A block of M less ε, and ε.
 
     The block is drawn towards its mean as far as it is not positive definite everywhere; if not even the mean
     is, a plain diagonal takes its place.
@@ -143,10 +138,7 @@ def _factor(
     smallest, least = (float(np.linalg.eigvalsh(matrix / unit).min()) for matrix in (mean, mass))
     share = 1.0 if least > smallest / 2 else smallest / (2 * (smallest - least))
     epsilon = SHARE * max(least, smallest / 2) * diagonal
-    factors = np.linalg.cholesky(mean + share * (mass - mean) - np.diag(epsilon))
-    size = len(diagonal)
-    coefficients = np.linalg.lstsq(basis, factors.reshape(-1, size**2), rcond=CUT)[0]
-    return np.asarray(coefficients.T, dtype=np.float64).reshape(size, size, -1), epsilon
+    return mean + share * (mass - mean) - np.diag(epsilon), epsilon
 
 
 def _believed(mean: Float[Array, "m m"], forces: Float[Array, " m"]) -> bool:

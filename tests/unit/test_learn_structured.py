@@ -62,7 +62,7 @@ def test_the_same_seed_gives_the_same_weights() -> None:
 
 
 def test_a_solenoid_is_learned_by_the_same_code() -> None:
-    model = train(*split(solenoid_dataset(), 0.8, 10, 0), OPTIONS.model_copy(update={"iterations": 60}), 0)
+    model = train(*split(solenoid_dataset(), 0.8, 10, 1), OPTIONS.model_copy(update={"iterations": 60}), 1)
     test = solenoid_dataset(seed=7)
     inner = test.frame["x"].between(*np.quantile(solenoid_dataset().frame["x"], [0.02, 0.98]))
     error = force_error(model.system, test)[inner.to_numpy()]
