@@ -15,11 +15,11 @@ from baselines.bench import Row
 
 COLUMNS = {
     "weights": "weights",
-    "seconds": "training s",
+    "seconds": "CPU s",
     "acceleration_mse": "MSE of q̈",
     "rollout_nrmse_2s": "2 s",
     "rollout_nrmse_10s": "10 s",
-    "rollout_nrmse_ood": "10 s o.o.d.",
+    "rollout_nrmse_ood": "beyond",
     "rollout_nrmse_100s": "100 s",
 }
 
@@ -54,8 +54,8 @@ def draw(rows: Sequence[Row], folder: Path) -> None:
     picture, (left, right) = plt.subplots(1, 2, figsize=(12, 4.8), layout="constrained")
     for row in rows:
         error = min(row.numbers["rollout_nrmse_10s"], 10.0)
-        ours = row.key == "ours"
-        colour = "black" if ours else None
+        ours = row.key.startswith("ours")
+        colour = {"ours.structured": "black", "ours.terms": "dimgray"}.get(row.key)
         (mark,) = left.loglog(row.numbers["seconds"], error, "*" if ours else "o", color=colour, markersize=9)
         left.annotate(
             row.name, (row.numbers["seconds"], error), (5, 4), textcoords="offset points", fontsize=8
@@ -64,6 +64,7 @@ def draw(rows: Sequence[Row], folder: Path) -> None:
         gap = np.abs(row.states[:, -1] - current) / current.std()
         smooth = pd.Series(gap).rolling(max(1, len(gap) // 50), min_periods=1).max()
         right.semilogy(row.run.frame["time"], smooth, color=mark.get_color(), label=row.name, lw=1)
+    left.margins(x=0.25)
     left.set(xlabel="training, CPU s of one thread", ylabel="NRMSE of a 10 s free run (10: diverged)")
     right.set(xlabel="time [s]", ylabel="error of i, relative to its standard deviation", ylim=(1e-13, 1e2))
     right.legend(fontsize=8, ncols=2)

@@ -52,9 +52,11 @@ def levenberg_marquardt(
         The start, then every accepted step.
     """
     damping, growth = FIRST_DAMPING, 2.0
+    now = value(theta)
+    # A caller that has seen enough is spared the Jacobian, which costs many times a value.
+    yield Step(theta, now)
     at = normal(theta)
     scale = np.diag(at.matrix).copy()
-    yield Step(theta, at.value)
     while damping < MOST_DAMPING:
         scale = np.maximum(scale, np.diag(at.matrix))
         step = _solve(at, damping * np.maximum(scale, np.finfo(float).tiny))
@@ -63,15 +65,15 @@ def levenberg_marquardt(
             continue
         new = value(theta + step)
         predicted = -2 * (step @ at.gradient) - step @ at.matrix @ step
-        gain = (at.value - new) / predicted if predicted > 0 else -1.0
-        if not new < at.value:  # also where it is not finite
+        gain = (now - new) / predicted if predicted > 0 else -1.0
+        if not new < now:  # also where it is not finite
             damping, growth = damping * growth, 2 * growth
             continue
-        theta = theta + step
+        theta, now = theta + step, new
         damping = max(float(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3)), LEAST_DAMPING)
         growth = 2.0
+        yield Step(theta, now)
         at = normal(theta)
-        yield Step(theta, at.value)
 
 
 def _solve(at: Normal, damping: Vector) -> Vector | None:
