@@ -64,7 +64,7 @@ def draw(rows: Sequence[Row], folder: Path) -> None:
         gap = np.abs(row.states[:, -1] - current) / current.std()
         smooth = pd.Series(gap).rolling(max(1, len(gap) // 50), min_periods=1).max()
         right.semilogy(row.run.frame["time"], smooth, color=mark.get_color(), label=row.name, lw=1)
-    left.margins(x=0.25)
+    left.set_xlim(1e-2, 3e3)
     left.set(xlabel="training, CPU s of one thread", ylabel="NRMSE of a 10 s free run (10: diverged)")
     right.set(xlabel="time [s]", ylabel="error of i, relative to its standard deviation", ylim=(1e-13, 1e2))
     right.legend(fontsize=8, ncols=2)
