@@ -45,7 +45,7 @@ from exlinn_fmi.learn.networks import StructuredNetworks
 from exlinn_fmi.learn.structured import structured_spec
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.plants.dc_motor_cart import COORDINATES, PLANT
-from exlinn_fmi.scenario.schema import Identify
+from exlinn_fmi.scenario.learning import Identify
 
 PARAMETERS = Identify(
     lagrangian={

@@ -34,7 +34,7 @@ from exlinn_fmi.learn.trajectory import Shooting, cut, maximum_likelihood
 from exlinn_fmi.learn.weak import weak_regression
 from exlinn_fmi.mechanics.monomials import MonomialBasis
 from exlinn_fmi.plants.dc_motor_cart import COORDINATES, PLANT
-from exlinn_fmi.scenario.schema import Sine
+from exlinn_fmi.scenario.signals import Sine
 
 STATES = ["alpha", "alpha_dot", "i"]
 FAMILY = MonomialBasis(

@@ -25,8 +25,8 @@ from exlinn_fmi.learn.card import report_card
 from exlinn_fmi.learn.train import train
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
 from exlinn_fmi.plants.dc_motor_cart import PLANT
+from exlinn_fmi.scenario.learning import Experiment, Learn, Paper
 from exlinn_fmi.scenario.load import load_scenario
-from exlinn_fmi.scenario.schema import Experiment, Learn, Paper
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "dcwc_paper.yaml"
 TARGET = 1e-2

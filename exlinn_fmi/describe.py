@@ -51,7 +51,7 @@ def describe_scenario(file: Path, overrides: Sequence[str]) -> str:
     """
     from exlinn_fmi.cosim.graph import Graph
     from exlinn_fmi.factory import outline
-    from exlinn_fmi.scenario.schema import LearnFromData
+    from exlinn_fmi.scenario.learning import LearnFromData
     from exlinn_fmi.workspace import Run
 
     work = Run.open(file, None, overrides)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from exlinn_fmi.data.files import read_json, write_json, write_text
 from exlinn_fmi.errors import InputError
 from exlinn_fmi.factory import model_system
-from exlinn_fmi.scenario.schema import LearnFromPlant, Noise, PlantComponent
+from exlinn_fmi.scenario.learning import LearnFromPlant, Noise
+from exlinn_fmi.scenario.schema import PlantComponent
 from exlinn_fmi.workspace import Run
 
 if TYPE_CHECKING:

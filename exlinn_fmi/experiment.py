@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
     from exlinn_fmi.cosim.master import Trajectories
     from exlinn_fmi.data.dataset import Dataset
-    from exlinn_fmi.scenario.schema import Experiment, LearnFromPlant, Simulate
+    from exlinn_fmi.scenario.learning import Experiment, LearnFromPlant
+    from exlinn_fmi.scenario.schema import Simulate
 
 COMPARED = ("L", "D")
 """Plant outputs that, where there are any of that name, the report compares the learned 𝓛 and D with."""

@@ -48,7 +48,7 @@ def collect(work: Run) -> Dataset:
     """
     from exlinn_fmi.data.dataset import load_dataset, save_dataset
     from exlinn_fmi.data.measured import import_measured
-    from exlinn_fmi.scenario.schema import LearnFromData
+    from exlinn_fmi.scenario.learning import LearnFromData
 
     learn = work.learn
     coordinates = tuple(c.coordinate() for c in learn.coordinates)
@@ -193,7 +193,7 @@ def report(folder: Path, reporter: Reporter | None = None) -> Path:
 
 def truth(work: Run) -> dict[str, float]:
     """Values of the plant's parameters, as far as it states them; the scenario's start values count."""
-    from exlinn_fmi.scenario.schema import LearnFromPlant
+    from exlinn_fmi.scenario.learning import LearnFromPlant
 
     if not isinstance(work.learn, LearnFromPlant):
         return {}

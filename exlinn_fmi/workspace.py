@@ -17,7 +17,8 @@ from exlinn_fmi.scenario.load import LoadedScenario, load_scenario, named_files
 from exlinn_fmi.stages import Stages
 
 if TYPE_CHECKING:
-    from exlinn_fmi.scenario.schema import AnyLearn, Scenario
+    from exlinn_fmi.scenario.learning import AnyLearn
+    from exlinn_fmi.scenario.schema import Scenario
 
 
 class Reporter(Protocol):

@@ -18,7 +18,9 @@ from exlinn_fmi.control.solver import Solver, make_solver
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.plants.dc_motor_cart import PLANT
-from exlinn_fmi.scenario.schema import Bounds, Constant, Nmpc, Reference, ScotchYoke, Sine
+from exlinn_fmi.scenario.control import Nmpc, Reference, ScotchYoke
+from exlinn_fmi.scenario.signals import Constant, Sine
+from exlinn_fmi.scenario.spec import Bounds
 
 HERE = Path(__file__).parent
 STEP = 0.01

@@ -11,7 +11,7 @@ import pandas as pd
 from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.data.measured import import_measured
 from exlinn_fmi.mechanics.coordinates import Coordinate
-from exlinn_fmi.scenario.schema import Measured
+from exlinn_fmi.scenario.learning import Measured
 
 COORDINATES = (
     Coordinate("alpha", "rad", topology="circle"),

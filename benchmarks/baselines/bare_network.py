@@ -16,7 +16,7 @@ from exlinn_fmi.learn.networks import StructuredNetworks
 from exlinn_fmi.learn.structured import structured_spec
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.learned import learned_system
-from exlinn_fmi.scenario.schema import Structured
+from exlinn_fmi.scenario.learning import Structured
 
 HIDDEN = 4
 EVERY = 5

@@ -16,7 +16,8 @@ from exlinn_fmi.learn.card import accelerations
 from exlinn_fmi.learn.rollout import free_run, nrmse
 from exlinn_fmi.learn.train import TrainedModel, train
 from exlinn_fmi.plants.dc_motor_cart import PLANT
-from exlinn_fmi.scenario.schema import Multisine, Sine, Structured, Terms
+from exlinn_fmi.scenario.learning import Structured, Terms
+from exlinn_fmi.scenario.signals import Multisine, Sine
 
 METHOD = Structured(preset="structured")
 """The default learner."""

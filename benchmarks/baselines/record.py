@@ -13,7 +13,7 @@ from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.data.excitation import signal_function
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
 from exlinn_fmi.mechanics.plant import Plant
-from exlinn_fmi.scenario.schema import Signal
+from exlinn_fmi.scenario.signals import Signal
 
 SUBSTEPS = 2
 """RK4 steps in a row: the data are exact to about 1e-13."""

@@ -9,7 +9,7 @@ import numpy as np
 from exlinn_fmi.components.base import Variable
 from exlinn_fmi.components.python import PythonComponent
 from exlinn_fmi.data.excitation import signal_function
-from exlinn_fmi.scenario.schema import Signal
+from exlinn_fmi.scenario.signals import Signal
 
 
 class SignalSource(PythonComponent):

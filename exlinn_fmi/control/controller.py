@@ -26,8 +26,8 @@ from exlinn_fmi.control.reference import ReferenceGenerator, References
 from exlinn_fmi.control.solver import Plan, Solution, SolveStatus, make_solver
 from exlinn_fmi.errors import InputError, ModelError, nearest
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
+from exlinn_fmi.scenario.control import Nmpc
 from exlinn_fmi.scenario.derived import nmpc_variables
-from exlinn_fmi.scenario.schema import Nmpc
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,8 @@ from exlinn_fmi.control.reference import References
 from exlinn_fmi.control.riccati import solve_dare
 from exlinn_fmi.errors import ModelError, nearest
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
-from exlinn_fmi.scenario.schema import Bounds, Nmpc
+from exlinn_fmi.scenario.control import Nmpc
+from exlinn_fmi.scenario.spec import Bounds
 
 BACK_OFF = 0.005
 """How far state bounds are moved inwards, as a share of their range."""

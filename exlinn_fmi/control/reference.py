@@ -20,7 +20,8 @@ from exlinn_fmi.control.trajectory import REACH, branch_of, coordinate_of, deriv
 from exlinn_fmi.data.excitation import signal_function
 from exlinn_fmi.errors import ModelError, nearest
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
-from exlinn_fmi.scenario.schema import Linear, Reference, ScotchYoke, Table
+from exlinn_fmi.scenario.control import Linear, Reference, ScotchYoke
+from exlinn_fmi.scenario.signals import Table
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from exlinn_fmi.scenario.schema import Linear, ScotchYoke
+from exlinn_fmi.scenario.control import Linear, ScotchYoke
 
 DEGREE = 8
 REACH = DEGREE

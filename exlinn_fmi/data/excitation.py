@@ -17,17 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from exlinn_fmi.errors import DataError, nearest
-from exlinn_fmi.scenario.schema import (
-    Chirp,
-    Constant,
-    Multisine,
-    Prbs,
-    Ramp,
-    Signal,
-    Sine,
-    Step,
-    Table,
-)
+from exlinn_fmi.scenario.signals import Chirp, Constant, Multisine, Prbs, Ramp, Signal, Sine, Step, Table
 
 Times = NDArray[np.float64]
 SignalFunction = Callable[[Times], NDArray[np.float64]]

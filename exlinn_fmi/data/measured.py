@@ -23,7 +23,7 @@ from exlinn_fmi.data.doubts import Recording, check_recordings, doubts
 from exlinn_fmi.data.foreign import ForeignTable, column_names, read_foreign
 from exlinn_fmi.errors import DataError
 from exlinn_fmi.mechanics.coordinates import Coordinate, input_names
-from exlinn_fmi.scenario.schema import Column, LowPass, Measured, Resample
+from exlinn_fmi.scenario.learning import Column, LowPass, Measured, Resample
 from exlinn_fmi.scenario.units import conversion
 
 GAP = 4.5

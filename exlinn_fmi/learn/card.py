@@ -22,7 +22,7 @@ from exlinn_fmi.learn.rollout import free_run, nrmse
 from exlinn_fmi.learn.terms import formula, term_table
 from exlinn_fmi.learn.train import TrainedModel
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
-from exlinn_fmi.scenario.schema import Identify, Objective
+from exlinn_fmi.scenario.learning import Identify, Objective
 
 Array = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from exlinn_fmi.data.excitation import signal_function
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.sensitivity import Propagator
-from exlinn_fmi.scenario.schema import Multisine, Signal
+from exlinn_fmi.scenario.signals import Multisine, Signal
 
 Array = NDArray[np.float64]
 

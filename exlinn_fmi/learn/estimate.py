@@ -23,7 +23,7 @@ from exlinn_fmi.learn.noise import CLEAN
 from exlinn_fmi.learn.terms import choose, linear_fit, regress
 from exlinn_fmi.learn.trajectory import Fit, cut, maximum_likelihood
 from exlinn_fmi.mechanics.monomials import MonomialBasis
-from exlinn_fmi.scenario.schema import Identify, Objective
+from exlinn_fmi.scenario.learning import Identify, Objective
 
 Array = NDArray[np.float64]
 

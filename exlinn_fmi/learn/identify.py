@@ -20,7 +20,7 @@ from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
 from exlinn_fmi.mechanics.monomials import MonomialBasis, parse_monomial
-from exlinn_fmi.scenario.schema import Identify
+from exlinn_fmi.scenario.learning import Identify
 
 SAMPLES = 2000
 SINGULAR = 1e-8

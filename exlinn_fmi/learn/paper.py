@@ -30,7 +30,7 @@ from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
 from exlinn_fmi.mechanics.learned import ModelSpec, learned_system
 from exlinn_fmi.mechanics.monomials import MonomialBasis
-from exlinn_fmi.scenario.schema import Paper
+from exlinn_fmi.scenario.learning import Paper
 
 NETWORKS = ("lagrangian", "dissipation")
 

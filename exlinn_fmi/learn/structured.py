@@ -29,7 +29,7 @@ from exlinn_fmi.learn.levenberg import Normal, levenberg_marquardt
 from exlinn_fmi.learn.networks import StructuredNetworks
 from exlinn_fmi.learn.start import Start, linear_start
 from exlinn_fmi.mechanics.learned import ModelSpec
-from exlinn_fmi.scenario.schema import Structured
+from exlinn_fmi.scenario.learning import Structured
 
 Array = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from exlinn_fmi.learn.trajectory import Fit, Information, Shooting, cut, even
 from exlinn_fmi.learn.weak import OVERLAP, Regression, inverse_regression, weak_regression
 from exlinn_fmi.mechanics.learned import ModelSpec
 from exlinn_fmi.mechanics.monomials import MonomialBasis
-from exlinn_fmi.scenario.schema import Objective, Terms
+from exlinn_fmi.scenario.learning import Objective, Terms
 
 Array = NDArray[np.float64]
 

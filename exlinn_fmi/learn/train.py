@@ -19,7 +19,7 @@ from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.learned import ModelSpec, learned_system
-from exlinn_fmi.scenario.schema import Objective, Paper, Structured, Terms
+from exlinn_fmi.scenario.learning import Objective, Paper, Structured, Terms
 
 Status = Literal["converged", "iterations", "interrupted"]
 HISTORY = ["iteration", "stage", "loss", "validation_loss", "seconds"]

@@ -17,7 +17,7 @@ from exlinn_fmi.results.typography import readable, typeset, words
 if TYPE_CHECKING:
     import pandas as pd
 
-    from exlinn_fmi.scenario.schema import Bounds
+    from exlinn_fmi.scenario.spec import Bounds
 
 MOST_PANELS = 12
 MOST_LINES = 6

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from exlinn_fmi.scenario.schema import Bounds, Nmpc, NmpcComponent, Scenario
+from exlinn_fmi.scenario.control import Nmpc
+from exlinn_fmi.scenario.schema import NmpcComponent, Scenario
+from exlinn_fmi.scenario.spec import Bounds
 
 if TYPE_CHECKING:
     import pandas as pd

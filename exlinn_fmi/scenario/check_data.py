@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from exlinn_fmi.errors import DataError
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.scenario.explain import Finding
-from exlinn_fmi.scenario.schema import Column, LearnFromData, Measured, Resample
+from exlinn_fmi.scenario.learning import Column, LearnFromData, Measured, Resample
 from exlinn_fmi.scenario.survey import Survey
 from exlinn_fmi.scenario.units import conversion
 from exlinn_fmi.scenario.words import KeyPath, missing_file, suggestion

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 
 from exlinn_fmi.mechanics.coordinates import input_names, state_names
 from exlinn_fmi.scenario.explain import Finding
-from exlinn_fmi.scenario.schema import Design, LearnFromPlant
+from exlinn_fmi.scenario.learning import Design, LearnFromPlant
 from exlinn_fmi.scenario.survey import Survey
 from exlinn_fmi.scenario.words import KeyPath, missing_file, suggestion
 

@@ -8,7 +8,7 @@ from fnmatch import fnmatchcase
 from exlinn_fmi.components.base import Variable
 from exlinn_fmi.components.starts import takes_start, value_problem
 from exlinn_fmi.scenario.explain import Finding
-from exlinn_fmi.scenario.schema import LearnFromData
+from exlinn_fmi.scenario.learning import LearnFromData
 from exlinn_fmi.scenario.survey import Survey
 from exlinn_fmi.scenario.units import same_unit
 from exlinn_fmi.scenario.words import KeyPath, suggestion

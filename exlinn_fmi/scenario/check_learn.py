@@ -10,27 +10,21 @@ from exlinn_fmi.components.base import Variable
 from exlinn_fmi.errors import DataError, ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate, check_coordinates
 from exlinn_fmi.scenario.check_graph import is_multiple, misfit_starts, no_multiple
+from exlinn_fmi.scenario.control import Nmpc
 from exlinn_fmi.scenario.explain import Finding
-from exlinn_fmi.scenario.schema import (
+from exlinn_fmi.scenario.learning import (
     AnyLearn,
-    Bounds,
-    Chirp,
     Experiment,
     Identify,
     LearnFromPlant,
-    ModelComponent,
-    Multisine,
-    Nmpc,
-    NmpcComponent,
     Paper,
     PlantCoordinate,
-    Ramp,
-    Signal,
-    SignalComponent,
     Structured,
-    Table,
     Terms,
 )
+from exlinn_fmi.scenario.schema import ModelComponent, NmpcComponent, SignalComponent
+from exlinn_fmi.scenario.signals import Chirp, Multisine, Ramp, Signal, Table
+from exlinn_fmi.scenario.spec import Bounds
 from exlinn_fmi.scenario.survey import Role, Survey
 from exlinn_fmi.scenario.units import same_unit
 from exlinn_fmi.scenario.words import KeyPath, suggestion

@@ -6,15 +6,8 @@ from collections.abc import Sequence
 
 from exlinn_fmi.components.base import Variable, VariableType
 from exlinn_fmi.mechanics.coordinates import Coordinate, state_names, state_units
-from exlinn_fmi.scenario.schema import (
-    ComponentBase,
-    ModelComponent,
-    Nmpc,
-    NmpcComponent,
-    Reference,
-    ScotchYoke,
-    SignalComponent,
-)
+from exlinn_fmi.scenario.control import Nmpc, Reference, ScotchYoke
+from exlinn_fmi.scenario.schema import ComponentBase, ModelComponent, NmpcComponent, SignalComponent
 
 
 def derived_variables(spec: ComponentBase, learned: Sequence[Coordinate]) -> tuple[Variable, ...] | None:

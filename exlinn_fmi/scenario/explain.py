@@ -24,7 +24,8 @@ from exlinn_fmi.scenario.places import (
     locate,
     telling_keys,
 )
-from exlinn_fmi.scenario.schema import ComponentBase, ComponentSpec, Scenario, Spec
+from exlinn_fmi.scenario.schema import ComponentBase, ComponentSpec, Scenario
+from exlinn_fmi.scenario.spec import Spec
 from exlinn_fmi.scenario.words import KeyPath, closest, either, found, listing, suggestion
 
 Finding = tuple[KeyPath, str]

@@ -15,16 +15,16 @@ from exlinn_fmi.scenario import check_data, check_design, check_graph, check_lea
 from exlinn_fmi.scenario.document import Document, parse
 from exlinn_fmi.scenario.editor import json_schema
 from exlinn_fmi.scenario.explain import Finding, schema_findings
+from exlinn_fmi.scenario.learning import Measured
 from exlinn_fmi.scenario.overrides import apply
 from exlinn_fmi.scenario.schema import (
     FmuComponent,
-    Measured,
     ModelComponent,
     NmpcComponent,
     PythonComponentSpec,
     Scenario,
-    Table,
 )
+from exlinn_fmi.scenario.signals import Table
 from exlinn_fmi.scenario.survey import Inspect, survey
 from exlinn_fmi.scenario.words import KeyPath, key_path, missing_file
 

@@ -10,7 +10,9 @@ from dataclasses import dataclass, replace
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeGuard, Union, get_args, get_origin
 
-from exlinn_fmi.scenario.schema import COMPONENT_KEYS, LEARN_KEYS, Scenario, Spec, telling_key
+from exlinn_fmi.scenario.learning import LEARN_KEYS
+from exlinn_fmi.scenario.schema import COMPONENT_KEYS, Scenario
+from exlinn_fmi.scenario.spec import Spec, telling_key
 from exlinn_fmi.scenario.words import KeyPath
 
 

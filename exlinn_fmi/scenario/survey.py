@@ -12,14 +12,12 @@ from exlinn_fmi.errors import InputError, ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate, check_coordinates
 from exlinn_fmi.scenario.derived import derived_variables
 from exlinn_fmi.scenario.explain import Finding, Sound, sound_part
+from exlinn_fmi.scenario.learning import LearnFromData, LearnFromPlant, PlantCoordinate
 from exlinn_fmi.scenario.schema import (
     ComponentBase,
     FmuComponent,
-    LearnFromData,
-    LearnFromPlant,
     ModelComponent,
     NmpcComponent,
-    PlantCoordinate,
     PythonComponentSpec,
     Scenario,
     SignalComponent,

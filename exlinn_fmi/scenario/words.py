@@ -7,7 +7,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from exlinn_fmi.scenario.schema import form
+from exlinn_fmi.scenario.spec import form
 
 KeyPath = tuple[str | int, ...]
 """Where a value stands in a scenario: keys of mappings and indices of lists, from the top."""

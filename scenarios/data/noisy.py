@@ -9,7 +9,7 @@ import pandas as pd
 
 from exlinn_fmi.data.excitation import signal_function
 from exlinn_fmi.plants.dc_motor_cart import PLANT
-from exlinn_fmi.scenario.schema import Multisine, Signal, Sine
+from exlinn_fmi.scenario.signals import Multisine, Signal, Sine
 
 STATES = ["alpha", "alpha_dot", "i"]
 FOLDER = Path(__file__).parent

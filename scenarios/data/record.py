@@ -17,7 +17,7 @@ import pandas as pd
 
 from exlinn_fmi.data.excitation import signal_function
 from exlinn_fmi.plants.dc_motor_cart import PLANT
-from exlinn_fmi.scenario.schema import Multisine
+from exlinn_fmi.scenario.signals import Multisine
 
 STEP = 2e-3
 SUBSTEPS = 4

@@ -8,7 +8,9 @@ from control_helpers import CART, arm, close_loop, constant, controller, levitat
 
 from exlinn_fmi.components.base import Status
 from exlinn_fmi.control.batch import Batch
-from exlinn_fmi.scenario.schema import Bounds, Reference, ScotchYoke, Sine, Step, Weights
+from exlinn_fmi.scenario.control import Reference, ScotchYoke, Weights
+from exlinn_fmi.scenario.signals import Sine, Step
+from exlinn_fmi.scenario.spec import Bounds
 
 START = np.array([np.pi / 2, 0.0, 0.0])
 

@@ -25,7 +25,8 @@ from exlinn_fmi.learn.structured import structured_spec
 from exlinn_fmi.mechanics.plant import Plant
 from exlinn_fmi.plants.dc_motor_cart import PLANT
 from exlinn_fmi.plants.motor_pendulum import PLANT as PENDULUM
-from exlinn_fmi.scenario.schema import Multisine, Structured
+from exlinn_fmi.scenario.learning import Structured
+from exlinn_fmi.scenario.signals import Multisine
 
 SIGNAL = Multisine(signal="multisine", offset=2.9, rms=2.9, band=(0.5, 5), seed=3)
 LAGRANGIAN = (DeLaN, Lnn)

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 from exlinn_fmi.components.base import Status
 from exlinn_fmi.components.signals import SignalSource
 from exlinn_fmi.errors import DataError
-from exlinn_fmi.scenario.schema import Signal
+from exlinn_fmi.scenario.signals import Signal
 
 
 def source(folder: Path = Path(), **spec: object) -> SignalSource:

@@ -12,7 +12,8 @@ from exlinn_fmi.control.solver import Plan, Solution, Solver, SolveStatus, Stats
 from exlinn_fmi.errors import DataError, InputError, ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
-from exlinn_fmi.scenario.schema import Linear, Reference, Table, Weights
+from exlinn_fmi.scenario.control import Linear, Reference, Weights
+from exlinn_fmi.scenario.signals import Table
 
 START = (np.pi / 2, 0.0, 0.0)
 

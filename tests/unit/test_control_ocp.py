@@ -15,7 +15,8 @@ from exlinn_fmi.control.riccati import solve_dare
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
-from exlinn_fmi.scenario.schema import Bounds, Nmpc, Weights
+from exlinn_fmi.scenario.control import Nmpc, Weights
+from exlinn_fmi.scenario.spec import Bounds
 
 
 def ocp(system: LagrangianSystem, **options) -> Ocp:

@@ -22,7 +22,8 @@ from exlinn_fmi.control.reference import ReferenceGenerator, References
 from exlinn_fmi.errors import DataError, ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
-from exlinn_fmi.scenario.schema import Linear, Reference, ScotchYoke, Sine, Step, Table
+from exlinn_fmi.scenario.control import Linear, Reference, ScotchYoke
+from exlinn_fmi.scenario.signals import Sine, Step, Table
 
 START = np.array([np.pi / 2, 0.0, 0.0])
 

@@ -14,7 +14,8 @@ from exlinn_fmi.control.solver import GaussNewton, Plan, Solution, SolveStatus
 from exlinn_fmi.errors import SolverError
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
-from exlinn_fmi.scenario.schema import Bounds, Weights
+from exlinn_fmi.scenario.control import Weights
+from exlinn_fmi.scenario.spec import Bounds
 
 KINDS = ["rti", "sqp", "ipopt"]
 REST = constant("x", 0.0)

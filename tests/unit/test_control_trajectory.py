@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from exlinn_fmi.control.trajectory import REACH, branch_of, coordinate_of, derivatives, integral
-from exlinn_fmi.scenario.schema import Linear, ScotchYoke
+from exlinn_fmi.scenario.control import Linear, ScotchYoke
 
 SPACING = 5e-3
 YOKE = ScotchYoke(map="scotch_yoke", crank=0.2)

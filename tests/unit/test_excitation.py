@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 from exlinn_fmi.data.excitation import maximum_length_sequence, signal_function
 from exlinn_fmi.errors import DataError
-from exlinn_fmi.scenario.schema import Signal
+from exlinn_fmi.scenario.signals import Signal
 
 SPECS = {
     "constant": {"value": 3.0},

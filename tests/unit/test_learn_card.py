@@ -17,7 +17,7 @@ from exlinn_fmi.learn.rollout import free_run, nrmse
 from exlinn_fmi.learn.train import TrainedModel
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.plants.dc_motor_cart import PLANT
-from exlinn_fmi.scenario.schema import Identify
+from exlinn_fmi.scenario.learning import Identify
 
 TRUTH = {p.name: p.value for p in PLANT.parameters}
 OPTIONS = Identify(

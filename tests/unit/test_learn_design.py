@@ -17,7 +17,7 @@ from exlinn_fmi.mechanics.family import family
 from exlinn_fmi.mechanics.learned import learned_system
 from exlinn_fmi.mechanics.monomials import MonomialBasis
 from exlinn_fmi.plants.dc_motor_cart import PLANT
-from exlinn_fmi.scenario.schema import Multisine, Sine
+from exlinn_fmi.scenario.signals import Multisine, Sine
 from tests.learn_helpers import MOTOR_CART, random_model, simulate
 
 NAMES = ("j_m", "m_c*d^2", "l", "k_e", "b_m", "r")

@@ -10,7 +10,7 @@ from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.learn.card import report_card
 from exlinn_fmi.learn.estimate import estimate
 from exlinn_fmi.learn.train import train
-from exlinn_fmi.scenario.schema import Identify, Terms
+from exlinn_fmi.scenario.learning import Identify, Terms
 
 OPTIONS = Identify(
     lagrangian={

@@ -10,7 +10,7 @@ from learn_helpers import motor_cart_dataset
 
 from exlinn_fmi.learn.factor import fit_factor
 from exlinn_fmi.learn.structured import iterate_structured, structured_spec
-from exlinn_fmi.scenario.schema import Structured
+from exlinn_fmi.scenario.learning import Structured
 
 
 def circle(count: int = 300) -> np.ndarray:

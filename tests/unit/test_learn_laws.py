@@ -20,7 +20,7 @@ from exlinn_fmi.learn.train import TrainedModel, train
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
 from exlinn_fmi.mechanics.learned import FAITHFUL, ModelSpec, Weights, learned_system
-from exlinn_fmi.scenario.schema import Identify, Structured
+from exlinn_fmi.scenario.learning import Identify, Structured
 from tests.learn_helpers import MOTOR_CART, SOLENOID, motor_cart, random_model, solenoid_dataset
 
 SECONDS = 1000.0

@@ -18,7 +18,7 @@ from exlinn_fmi.learn.paper import _Data, _Pair, paper_spec
 from exlinn_fmi.learn.train import TrainedModel, train
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
 from exlinn_fmi.plants.dc_motor_cart import PLANT
-from exlinn_fmi.scenario.schema import Paper
+from exlinn_fmi.scenario.learning import Paper
 
 OPTIONS = Paper(
     preset="paper",

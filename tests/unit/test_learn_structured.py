@@ -19,7 +19,7 @@ from exlinn_fmi.learn.start import linear_start
 from exlinn_fmi.learn.structured import iterate_structured, structured_spec
 from exlinn_fmi.learn.train import TrainedModel, TrainProgress, train
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
-from exlinn_fmi.scenario.schema import Structured
+from exlinn_fmi.scenario.learning import Structured
 
 OPTIONS = Structured(preset="structured")
 SHORT = OPTIONS.model_copy(update={"iterations": 5})

@@ -19,7 +19,7 @@ from exlinn_fmi.learn.weights import load_model, save_model
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
 from exlinn_fmi.mechanics.monomials import MonomialBasis, parse_monomial
-from exlinn_fmi.scenario.schema import Terms
+from exlinn_fmi.scenario.learning import Terms
 
 FOUND = {
     "0.5*alpha_dot^2",

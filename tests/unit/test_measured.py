@@ -15,7 +15,7 @@ from exlinn_fmi.data.dataset import load_dataset, save_dataset
 from exlinn_fmi.data.doubts import plateaus
 from exlinn_fmi.data.measured import held_out, resample, unwrap
 from exlinn_fmi.errors import DataError
-from exlinn_fmi.scenario.schema import Measured, Resample
+from exlinn_fmi.scenario.learning import Measured, Resample
 
 # ── from file to model ───────────────────────────────────────────────────────────────────────────────────
 

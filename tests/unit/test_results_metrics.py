@@ -11,7 +11,8 @@ from results_helpers import UNITS, scenario_text, trajectories
 from ruamel.yaml import YAML
 
 from exlinn_fmi.results.metrics import control_loops, control_metrics, outside, quantity
-from exlinn_fmi.scenario.schema import Bounds, Scenario
+from exlinn_fmi.scenario.schema import Scenario
+from exlinn_fmi.scenario.spec import Bounds
 
 
 def scenario(text: str | None = None) -> Scenario:

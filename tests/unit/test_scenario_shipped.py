@@ -18,21 +18,12 @@ from exlinn_fmi.components.lagrangian import variables_of
 from exlinn_fmi.components.python import load_python_component
 from exlinn_fmi.control.controller import NmpcController
 from exlinn_fmi.plants.dc_motor_cart import PLANT
+from exlinn_fmi.scenario.control import Linear, Nmpc, Reference, ScotchYoke
 from exlinn_fmi.scenario.derived import derived_variables, model_variables, nmpc_variables, reference_unit
 from exlinn_fmi.scenario.document import parse
 from exlinn_fmi.scenario.load import json_schema, load_scenario, named_files
-from exlinn_fmi.scenario.schema import (
-    FmuComponent,
-    Linear,
-    ModelComponent,
-    Nmpc,
-    NmpcComponent,
-    PythonComponentSpec,
-    Reference,
-    ScotchYoke,
-    Sine,
-    Table,
-)
+from exlinn_fmi.scenario.schema import FmuComponent, ModelComponent, NmpcComponent, PythonComponentSpec
+from exlinn_fmi.scenario.signals import Sine, Table
 
 FOLDER = Path(__file__).parents[2] / "scenarios"
 FILES = sorted(FOLDER.glob("*.yaml"))

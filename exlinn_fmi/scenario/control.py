@@ -1,0 +1,91 @@
+"""The vocabulary of the controller: reference, cost, bounds and solver of an NMPC."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Discriminator, Field, Tag
+
+from exlinn_fmi.scenario.signals import Signal
+from exlinn_fmi.scenario.spec import Bounds, NonNegative, Positive, Spec, form
+
+
+class ScotchYoke(Spec):
+    """Position of a cart driven through a scotch yoke, x = crank · cos(coordinate)."""
+
+    map: Literal["scotch_yoke"]
+    crank: Positive = Field(description="crank radius d [m]; the stroke is ± d")
+    margin: NonNegative = Field(
+        1e-3,
+        lt=1,
+        description="share of the stroke kept free at both ends, where x = d cos α cannot be inverted",
+    )
+
+
+class Linear(Spec):
+    """A quantity proportional to the coordinate, y = gain · coordinate + offset (a gear, a spindle)."""
+
+    map: Literal["linear"]
+    gain: float = Field(1.0, description="gain")
+    offset: float = Field(0.0, description="offset")
+
+
+class Reference(Spec):
+    """What the controller follows: a signal for one quantity, and how that hangs on a coordinate."""
+
+    coordinate: str = Field(description="position or velocity of the model that follows the reference")
+    trajectory: Signal = Field(description="the reference over time")
+    through: Annotated[ScotchYoke | Linear, Field(discriminator="map")] | None = Field(
+        None,
+        description="kinematics between the trajectory's quantity and the coordinate; the same if not given",
+    )
+
+
+Weight = Annotated[
+    Annotated[NonNegative, Tag("a number")] | Annotated[dict[str, NonNegative], Tag("a mapping")],
+    Discriminator(form),
+]
+
+
+class Weights(Spec):
+    """Weights of the cost: a number, or one by name (those not named weigh 0)."""
+
+    states: Weight = Field(10.0, description="Q, on x_ref − x; a number weighs the referenced state alone")
+    inputs: Weight = Field(
+        1e-3, description="R, on u, or on u − u_ref for tracking; a number weighs all inputs"
+    )
+    terminal: Annotated[
+        Annotated[Literal["dare"], Tag("text")] | Annotated[NonNegative, Tag("a number")], Discriminator(form)
+    ] = Field("dare", description="terminal cost: the Riccati solution at the reference, or a multiple of Q")
+
+
+class Nmpc(Spec):
+    """Nonlinear model predictive control around a learned model: eqs. (13), (14), Algorithm 1."""
+
+    model: str = Field(
+        "learned",
+        description="`learned`: what this scenario's `learn` trains; `plant:NAME`: a plant of ours; "
+        "else a folder with model.json",
+    )
+    reference: Reference = Field(description="what to follow")
+    horizon: int = Field(30, ge=1, le=10_000, description="N_p, number of intervals")
+    cost: Literal["tracking", "paper"] = Field(
+        "tracking",
+        description="`tracking`: states and inputs against a reference trajectory that the model can follow; "
+        "`paper`: Σ‖x_ref−x‖²_Q + ‖u‖²_R, eq. (13)",
+    )
+    weights: Weights = Field(default_factory=lambda: Weights(), description="Q, R and the terminal cost")
+    inputs: dict[str, Bounds] = Field(default_factory=dict, description="bounds on inputs, by name")
+    states: dict[str, Bounds] = Field(
+        default_factory=dict, description="bounds on states, by name (softened)"
+    )
+    solver: Literal["rti", "sqp", "ipopt"] = Field(
+        "rti", description="`rti`: one QP a step; `sqp`: until converged; `ipopt`: interior point"
+    )
+    iterations: int = Field(50, ge=1, description="most iterations of `sqp` and `ipopt`")
+    tolerance: Positive = Field(1e-8, description="KKT tolerance of `sqp` and `ipopt`")
+    substeps: int = Field(1, ge=1, le=100, description="RK4 steps in one interval")
+    safe_input: dict[str, float] = Field(
+        default_factory=dict,
+        description="input to fall back to when there is no plan left, by name; 0 if not given",
+    )
