@@ -38,7 +38,8 @@ bench: .venv/.bench
 	touch $@
 
 .venv/.dev: .venv/.user
-	$(INSTALL) -e '.[dev,bench]'
+	$(INSTALL) -e '.[dev,bench,compiler]'
+	$(INSTALL) --no-deps gemseo-fmu  # for the FMUs of OpenModelica inside
 	touch $@
 
 .venv/.bench: .venv/.dev
