@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
-from exlinn_fmi.components.fmu_file import FmuDescription, check_runnable, read_description, unpack
+from exlinn_fmi.components.fmu_description import FmuDescription
+from exlinn_fmi.components.fmu_file import check_runnable, read_description, unpack
 from exlinn_fmi.components.fmu_native import (
     Instance,
     make_instance,

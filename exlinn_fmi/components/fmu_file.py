@@ -1,7 +1,7 @@
 """FMU files: what is in one, checked before any of its code is loaded, and unpacking it.
 
 An FMU comes from outside, so nothing in it is believed: names in the archive, sizes, the XML and the model
-identifier are checked here. FMPy reads the model description.
+identifier are checked here; what the model description says is in `fmu_description`.
 """
 
 from __future__ import annotations
@@ -14,14 +14,12 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
 from xml.etree import ElementTree
 
 import fmpy
 
-from exlinn_fmi.components.base import Causality, Variability, Variable, VariableType
+from exlinn_fmi.components.fmu_description import FmuDescription, describe
 from exlinn_fmi.errors import FmuError, StorageError, nearest
 
 DESCRIPTION = "modelDescription.xml"
@@ -33,58 +31,6 @@ LARGEST_HARMLESS = 2**30
 
 _UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 """What zipfile raises for damaged, encrypted and unknown contents."""
-
-_Key = tuple[str, int]
-"""Accessor and value reference of a variable."""
-
-_INTEGERS = ("Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64")
-_TYPES: dict[str, VariableType] = {
-    "Real": "Real",
-    "Float32": "Real",
-    "Float64": "Real",
-    "Integer": "Integer",
-    **dict.fromkeys(_INTEGERS, "Integer"),
-    "Boolean": "Boolean",
-    "Enumeration": "Enumeration",
-}
-
-
-@dataclass(frozen=True)
-class FmuDescription:
-    """What an FMU says of itself, as far as a Co-Simulation master needs it.
-
-    Args:
-        path: the file.
-        version: FMI major version.
-        identifier: name of the binary.
-        token: GUID (FMI 2) or instantiation token (FMI 3).
-        variables: its scalar numeric variables; arrays, strings, binaries and clocks are left out.
-        accessors: for each variable, the name of its get and set functions less the prefix, e.g. ``Real``.
-        references: for each variable, its value reference.
-        equal_steps: whether all communication steps must be equally long.
-        saves_state: whether its state can be saved and restored.
-        once: whether the binary may be instantiated only once per process.
-        tool: the tool that must be installed for it to run, None where none is needed.
-        log_categories: names of the log categories that it has.
-    """
-
-    path: Path
-    version: Literal[2, 3]
-    identifier: str
-    token: str
-    variables: tuple[Variable, ...]
-    accessors: tuple[str, ...]
-    references: tuple[int, ...]
-    equal_steps: bool
-    saves_state: bool
-    once: bool
-    tool: str | None
-    log_categories: tuple[str, ...]
-
-    @property
-    def platform(self) -> str:
-        """Name of this machine's folder in ``binaries``."""
-        return str(fmpy.platform if self.version == 2 else fmpy.platform_tuple)
 
 
 def read_description(path: Path) -> FmuDescription:
@@ -107,7 +53,7 @@ def read_description(path: Path) -> FmuDescription:
         found = f"it is for {' and '.join(kinds)} only" if kinds else "it names no kind of use"
         raise FmuError(f"{path}: no Co-Simulation: {found}; export it again for Co-Simulation")
     try:
-        return _description(path, fmpy.read_model_description(str(path), validate=False))
+        return describe(path, fmpy.read_model_description(str(path), validate=False))
     except FmuError:
         raise
     except Exception as error:  # FMPy reads what follows the schema; all else fails somewhere in it
@@ -281,88 +227,3 @@ def _check_whole(description: FmuDescription, folder: Path) -> None:
             f"{description.path}: the binary for {description.platform} is cut short at {len(data)} bytes; "
             "copy or export the FMU again"
         )
-
-
-# ── the model description ────────────────────────────────────────────────────────────────────────────────
-
-
-def _description(path: Path, model: Any) -> FmuDescription:
-    """Our description from FMPy's."""
-    use = model.coSimulation
-    identifier = use.modelIdentifier or ""
-    if not identifier or set(identifier) & set("/\\:\0") or identifier in (".", ".."):
-        raise FmuError(f"{path}: the model identifier {identifier!r} is no file name")
-    scalars = [v for v in model.modelVariables if v.type in _TYPES and not v.dimensions]
-    names = [v.name for v in scalars]
-    if len(set(names)) < len(names):
-        twice = next(name for k, name in enumerate(names) if name in names[:k])
-        raise FmuError(f"{path}: two variables are called {twice!r}")
-    version: Literal[2, 3] = 2 if model.fmiVersion == "2.0" else 3
-    enumeration = "Integer" if version == 2 else "Int64"
-
-    def key(v: Any) -> _Key:
-        """Value references of FMI 2 are unique within a type only; aliases share one."""
-        return enumeration if v.type == "Enumeration" else v.type, v.valueReference
-
-    inputs = {key(v): v.name for v in reversed(scalars) if v.causality == "input"}
-    depends: dict[_Key, tuple[str, ...] | None] = {}
-    for unknown in model.outputs:
-        said = unknown.dependencies
-        direct = None if said is None else dict.fromkeys(inputs[key(d)] for d in said if key(d) in inputs)
-        depends[key(unknown.variable)] = None if direct is None else tuple(direct)
-    return FmuDescription(
-        path=path,
-        version=version,
-        identifier=identifier,
-        token=model.guid or "",
-        variables=tuple(_variable(path, v, depends.get(key(v))) for v in scalars),
-        accessors=tuple(key(v)[0] for v in scalars),
-        references=tuple(key(v)[1] for v in scalars),
-        equal_steps=not use.canHandleVariableCommunicationStepSize,
-        saves_state=use.canGetAndSetFMUstate,
-        once=use.canBeInstantiatedOnlyOncePerProcess,
-        tool=(model.generationTool or "the tool that made it") if use.needsExecutionTool else None,
-        log_categories=tuple(category.name for category in model.logCategories),
-    )
-
-
-def _variable(path: Path, v: Any, depends_on: tuple[str, ...] | None) -> Variable:
-    """One variable in our words.
-
-    Raises:
-        FmuError: its start value or range is no number.
-    """
-    declared = v.declaredType
-    causality: Causality = v.causality
-    variability: Variability = v.variability
-    if v.causality == "calculatedParameter":
-        causality = "local"
-    elif v.causality == "structuralParameter":
-        # It sizes arrays, and could only change in configuration mode, which we do not enter.
-        causality, variability = "local", "constant"
-    low, high = v.min or getattr(declared, "min", None), v.max or getattr(declared, "max", None)
-    if v.type == "Enumeration" and declared is not None and declared.items:
-        items = [int(item.value) for item in declared.items]
-        low, high = min(items), max(items)
-    try:
-        return Variable(
-            name=v.name,
-            causality=causality,
-            variability=variability,
-            unit=v.unit or getattr(declared, "unit", None),
-            type=_TYPES[v.type],
-            start=_number(v.start),
-            description=v.description or "",
-            depends_on=depends_on if causality == "output" else (),
-            min=_number(low),
-            max=_number(high),
-        )
-    except ValueError as error:
-        raise FmuError(f"{path}: variable {v.name!r} (line {v.sourceline}): {error}") from error
-
-
-def _number(text: str | int | None) -> float | None:
-    """A start value or bound of the XML as a number, booleans as 0 and 1."""
-    if text is None:
-        return None
-    return {"true": 1.0, "false": 0.0}[text] if text in ("true", "false") else float(text)

@@ -22,7 +22,7 @@ import fmpy
 import numpy as np
 from fmpy import fmi2, fmi3
 
-from exlinn_fmi.components.fmu_file import FmuDescription
+from exlinn_fmi.components.fmu_description import FmuDescription
 from exlinn_fmi.errors import FmuError
 
 DISCARD, ERROR, FATAL = 2, 3, 4
