@@ -22,6 +22,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from exlinn_fmi.components.native import Native
+
 Causality = Literal["parameter", "input", "output", "local", "independent"]
 Variability = Literal["constant", "fixed", "tunable", "discrete", "continuous"]
 VariableType = Literal["Real", "Integer", "Boolean", "Enumeration"]
@@ -129,6 +131,21 @@ class Component(ABC):
     def restore_state(self, state: object) -> None:
         """Go back to a state that `save_state` returned."""
         raise NotImplementedError(f"{self.name} cannot restore its state; ask can_save_state first")
+
+    def native(self) -> Native | None:
+        """The C functions behind `set`, `get` and `step`, for compiled stepping; None where there are none.
+
+        Asked once initialisation is over; what is returned holds until the component is closed or a state is
+        saved. Calling them has the effect of `set`, `get` and `step` to the last bit.
+        """
+        return None
+
+    def outputs_over(self, indices: Indices, times: Values) -> Values | None:
+        """Variables at `indices` (k,) at `times` (n,) [s] as (n, k), where they depend on nothing but time.
+
+        None where they do: the component is set, read and stepped.
+        """
+        return None
 
     @abstractmethod
     def close(self) -> None:

@@ -11,7 +11,7 @@ import shutil
 import weakref
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,10 +20,12 @@ from exlinn_fmi.components.fmu_description import FmuDescription
 from exlinn_fmi.components.fmu_file import check_runnable, read_description, unpack
 from exlinn_fmi.components.fmu_native import (
     Instance,
+    address,
     make_instance,
     reference_buffer,
     value_buffer,
 )
+from exlinn_fmi.components.native import Native, NativeAccess
 from exlinn_fmi.components.starts import check_starts, takes_start
 from exlinn_fmi.errors import ComponentError
 
@@ -153,6 +155,31 @@ class FmuComponent(Component):
         code = self._instance.do_step(t, h)
         return Status.OK if code == 0 else self._check("DoStep", code)
 
+    def native(self) -> Native:
+        """The FMU's own functions."""
+        return _FmuNative(self)
+
+    def calls(self, verb: Literal["Get", "Set"], indices: Indices) -> list[NativeAccess]:
+        """The C calls that get or set these variables, one per type."""
+        found = []
+        for accessor, positions in _by_accessor(self._description, indices).items():
+            references = reference_buffer([self._description.references[indices[p]] for p in positions])
+            buffer = value_buffer(self._description, accessor, 0)
+            function, arguments = self._instance.accessor(verb, accessor, references, buffer)
+            found.append(
+                NativeAccess(
+                    name=f"{verb}{accessor}",
+                    function=address(function),
+                    handle=arguments[0],
+                    references=references,
+                    dtype=buffer.dtype,
+                    boolean=accessor == "Boolean",
+                    counted=len(arguments) > 4,
+                    positions=np.array(positions, dtype=np.intp),
+                )
+            )
+        return found
+
     def save_state(self) -> object:
         """The FMU's own copy of its state, freed when the object returned is dropped.
 
@@ -208,13 +235,18 @@ class _Plan:
     """The C calls that get or set one set of variables: one group per accessor, all buffers ready."""
 
     def __init__(self, description: FmuDescription, instance: Instance, verb: str, indices: Indices) -> None:
-        positions: dict[str, list[int]] = {}
-        for position, k in enumerate(indices):
-            positions.setdefault(description.accessors[k], []).append(position)
         self.groups = [
             _Group(description, instance, verb, accessor, indices, where)
-            for accessor, where in positions.items()
+            for accessor, where in _by_accessor(description, indices).items()
         ]
+
+
+def _by_accessor(description: FmuDescription, indices: Indices) -> dict[str, list[int]]:
+    """Positions in `indices` by accessor."""
+    positions: dict[str, list[int]] = {}
+    for position, k in enumerate(indices):
+        positions.setdefault(description.accessors[k], []).append(position)
+    return positions
 
 
 class _Group:
@@ -251,6 +283,22 @@ class _Group:
             return None
         refused = np.flatnonzero(self.buffer != given)
         return int(np.arange(len(values))[self.positions][refused[0]]) if refused.size else None
+
+
+class _FmuNative(Native):
+    """An FMU's C functions and what to make of their codes."""
+
+    def __init__(self, component: FmuComponent) -> None:
+        self._component = component
+        self.step = component._instance.native_step()
+
+    def access(self, verb: Literal["Get", "Set"], indices: Indices) -> list[NativeAccess]:
+        return self._component.calls(verb, indices)
+
+    def heed(self, function: str, code: int) -> Status:
+        if function == "DoStep":
+            code = self._component._instance.outcome(code)
+        return self._component._check(function, code)
 
 
 class _SavedState:

@@ -23,6 +23,7 @@ import numpy as np
 from fmpy import fmi2, fmi3
 
 from exlinn_fmi.components.fmu_description import FmuDescription
+from exlinn_fmi.components.native import NativeStep
 from exlinn_fmi.errors import FmuError
 
 DISCARD, ERROR, FATAL = 2, 3, 4
@@ -93,6 +94,7 @@ class Instance(ABC):
         self.pointer: int | None = None
         self._fmu = self._load()
         self._do_step: Any = None
+        self._outcome: tuple[int, ...] = ()
         self._handle = next(_handles)
         self._log = _logs.setdefault(self._handle, deque(maxlen=5))
         try:
@@ -231,6 +233,14 @@ class Instance(ABC):
     def do_step(self, t: float, h: float) -> int:
         """Advance from t to t + h [s]."""
 
+    @abstractmethod
+    def outcome(self, code: int) -> int:
+        """What the C function behind `do_step` returned, and the flags it set, as one code."""
+
+    def native_step(self) -> NativeStep:
+        """The C function behind `do_step`."""
+        return NativeStep(address(self._do_step), self.pointer or 0, not self.roll_back, self._outcome)
+
     # ── state ────────────────────────────────────────────────────────────────────────────────────────────
 
     state_noun: str
@@ -317,7 +327,10 @@ class Instance2(Instance):
 
     def do_step(self, t: float, h: float) -> int:
         """fmi2DoStep."""
-        code: int = self._do_step(self.pointer, t, h, not self.roll_back)
+        return self.outcome(self._do_step(self.pointer, t, h, not self.roll_back))
+
+    def outcome(self, code: int) -> int:
+        """What fmi2DoStep returned, with a remark where it says more."""
         if code == DISCARD:
             ended = c_int()
             self.function("GetBooleanStatus", c_void_p, c_int, c_void_p)(
@@ -384,7 +397,10 @@ class Instance3(Instance):
 
     def do_step(self, t: float, h: float) -> int:
         """fmi3DoStep; ending or returning early is a discarded step to us."""
-        code: int = self._do_step(self.pointer, t, h, not self.roll_back, *self._outcome)
+        return self.outcome(self._do_step(self.pointer, t, h, not self.roll_back, *self._outcome))
+
+    def outcome(self, code: int) -> int:
+        """What fmi3DoStep returned, or that it discarded the step where it wants to end or returned early."""
         if self._end.value or self._early.value:
             wish = "asks to end the simulation" if self._end.value else "returned early, which it may not"
             self.remark = f"the FMU {wish}, at t = {self._reached.value:.9g} s"
@@ -399,6 +415,11 @@ def make_instance(description: FmuDescription, folder: Path, name: str) -> Insta
         FmuError: the binary cannot be loaded, or refuses to be instantiated.
     """
     return (Instance2 if description.version == 2 else Instance3)(description, folder, name)
+
+
+def address(function: Any) -> int:
+    """Where a C function lies."""
+    return ctypes.cast(function, c_void_p).value or 0
 
 
 def value_buffer(description: FmuDescription, accessor: str, size: int) -> np.ndarray[Any, Any]:

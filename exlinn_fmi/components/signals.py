@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from exlinn_fmi.components.base import Variable
+from exlinn_fmi.components.base import Indices, Values, Variable
 from exlinn_fmi.components.python import PythonComponent
 from exlinn_fmi.data.excitation import signal_function
 from exlinn_fmi.scenario.signals import Signal
@@ -48,3 +48,7 @@ class SignalSource(PythonComponent):
         """The signal at t [s]."""
         self._now[0] = t
         self.values[:] = self._signal(self._now)
+
+    def outputs_over(self, indices: Indices, times: Values) -> Values:
+        """The signal at all times at once."""
+        return np.repeat(self._signal(times)[:, np.newaxis], len(indices), axis=1)

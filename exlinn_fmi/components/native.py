@@ -1,0 +1,84 @@
+"""The C functions of a component as addresses, for a master that calls them from compiled code.
+
+Addresses, handles and pointers are plain numbers: whoever steps needs no library of FMI to use them, only the
+argument lists given here, which are those of FMI 2.0 and 3.0.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from exlinn_fmi.components.base import Indices, Status
+
+
+@dataclass(frozen=True)
+class NativeAccess:
+    """A C function that gets or sets variables of one type: ``int f(handle, references, count, values)``.
+
+    Args:
+        name: of the function, for messages.
+        function: its address.
+        handle: its first argument.
+        references: value references, to be kept while it is called.
+        dtype: element type of the values.
+        boolean: whether the values are truth values, 0 and 1 only.
+        counted: whether ``count`` follows once more after ``values`` (FMI 3).
+        positions: which of the variables that were asked for it gets or sets, in this order.
+    """
+
+    name: str
+    function: int
+    handle: int
+    references: NDArray[np.uint32]
+    dtype: np.dtype[Any]
+    boolean: bool
+    counted: bool
+    positions: Indices
+
+
+@dataclass(frozen=True)
+class NativeStep:
+    """A C function that steps: ``int f(handle, t, h, flag)``, or FMI 3's with four pointers after the flag.
+
+    Args:
+        function: its address.
+        handle: its first argument.
+        flag: whether no state before t will be restored.
+        pointers: none, or where it writes whether an event is to be handled, whether the simulation is to
+            end, whether it returned early (one byte each), and the time reached.
+    """
+
+    function: int
+    handle: int
+    flag: bool
+    pointers: tuple[int, ...] = ()
+
+
+class Native(ABC):
+    """What a component offers for compiled stepping.
+
+    Attributes:
+        step: its step.
+    """
+
+    step: NativeStep
+
+    @abstractmethod
+    def access(self, verb: Literal["Get", "Set"], indices: Indices) -> Sequence[NativeAccess]:
+        """The calls that get or set the variables at `indices`, in order."""
+
+    @abstractmethod
+    def heed(self, function: str, code: int) -> Status:
+        """A code other than 0 that a function returned, as a status, with the component's message set.
+
+        Args:
+            function: `NativeAccess.name`, or ``DoStep``; this one also if its end or early flag was set.
+            code: what it returned.
+        """
