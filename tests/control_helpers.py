@@ -99,7 +99,7 @@ def problem(system: LagrangianSystem, kind: str = "sqp", **options: Any) -> tupl
     """A solver with its references."""
     settings = Nmpc(**({"reference": CART} | options))
     made = generator(system, settings.reference, settings.horizon)
-    ocp = Ocp(system, settings, STEP, made.state)
+    ocp = Ocp(system, settings, STEP, made.states)
     return make_solver(ocp, kind, settings.iterations, settings.tolerance), made
 
 

@@ -36,7 +36,7 @@ class _Memory:
 
     Args:
         time: of the coming tick [s].
-        branch: branch of the reference's kinematics, None before the first measurement.
+        branch: branch of the references' kinematics, None before the first measurement.
         plan: guess for the coming tick, None where there is none.
         left: how many inputs of the plan are left to fall back on.
         references: the last reference.
@@ -47,7 +47,7 @@ class _Memory:
     """
 
     time: float = 0.0
-    branch: int | None = None
+    branch: tuple[int, ...] | None = None
     plan: Plan | None = None
     left: int = 0
     references: References | None = None
@@ -85,7 +85,7 @@ class NmpcController(Component):
         self.name = name
         try:
             self._generator = ReferenceGenerator(system, options.reference, folder, step, options.horizon)
-            self._ocp = Ocp(system, options, step, self._generator.state)
+            self._ocp = Ocp(system, options, step, self._generator.states)
             check_names("safe_input", options.safe_input, system.input_names)
         except ModelError as error:
             raise ModelError(f"components.{name}.nmpc.{error}") from None
@@ -193,10 +193,10 @@ class NmpcController(Component):
             ]
             message = f"measurement of {', '.join(wrong)} is not finite"
         if solution.status == SolveStatus.FAILED:
-            u, following, action = self._fall_back(memory)
+            u, following, action = self._fall_back(memory, references)
             message = f"{message}; {action}"
         else:
-            u, following = solution.u[0], self._accept(memory, solution)
+            u, following = solution.u[0], self._accept(memory, solution, references)
         # A branch is decided by a measurement, and by nothing else.
         decided = branch if usable else memory.branch
         self._following = replace(following, branch=decided, references=references if usable else None)
@@ -206,20 +206,20 @@ class NmpcController(Component):
         self.message = f"t = {memory.time:.9g} s: {message}"
         return Status.WARNING
 
-    def _accept(self, memory: _Memory, solution: Solution) -> _Memory:
+    def _accept(self, memory: _Memory, solution: Solution, references: References) -> _Memory:
         """What follows a solution."""
-        plan = Plan(*self._ocp.shift(solution.x, solution.u))
+        plan = Plan(*self._ocp.shift(solution.x, solution.u, references.force))
         stats = solution.stats
         return replace(
             memory, plan=plan, left=self._ocp.horizon - 1, cost=stats.cost, kkt=stats.kkt, slack=stats.slack
         )
 
-    def _fall_back(self, memory: _Memory) -> tuple[NDArray[np.float64], _Memory, str]:
+    def _fall_back(self, memory: _Memory, references: References) -> tuple[NDArray[np.float64], _Memory, str]:
         """Input of the shifted plan, or the safe one, what follows it, and what was done."""
         count = memory.fallbacks + 1
         if memory.plan is None or memory.left == 0:
             return self._safe, replace(memory, plan=None, left=0, fallbacks=count), "applied the safe input"
-        shifted = Plan(*self._ocp.shift(memory.plan.x, memory.plan.u))
+        shifted = Plan(*self._ocp.shift(memory.plan.x, memory.plan.u, references.force))
         following = replace(memory, plan=shifted, left=memory.left - 1, fallbacks=count)
         return memory.plan.u[0], following, f"went on with the last plan, {memory.left} inputs left"
 
@@ -237,7 +237,7 @@ class NmpcController(Component):
         self._outputs = np.concatenate(
             [
                 bounded,
-                [references.quantity],
+                references.quantity,
                 references.x[0],
                 [following.cost],
                 counts,

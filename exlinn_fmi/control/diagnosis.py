@@ -60,7 +60,7 @@ def smallest_inertia(system: LagrangianSystem, x: Float[np.ndarray, " n"]) -> fl
 
 def response_time(ocp: Ocp, x: Float[np.ndarray, " n"], u: Float[np.ndarray, " m"]) -> float | None:
     """1/|λ| [s] of the slowest mode of the linearised model that is no integrator; None if there is none."""
-    A, _ = ocp.linearise_at(x, u)
+    A, _ = ocp.linearise_at(x, u, np.zeros(ocp.system.n))
     if not np.isfinite(A).all():
         return None
     multipliers = np.abs(np.linalg.eigvals(A).astype(complex))

@@ -1,10 +1,10 @@
-"""Inverting a Lagrangian system along the trajectory of one coordinate: which state and input follow it?
+"""Inverting a Lagrangian system along the trajectory of some coordinates: which state and input follow it?
 
-**Flat.** The rows of the inverse model (17) without input must vanish. Given the referenced coordinate and
-its derivatives they are equations for the other coordinates: for their velocities where those are cyclic (the
-current of a motor), for their positions where not (the charge of an actuator). Where there are as many of
-these equations as unknowns z, and they contain no derivative of z, the coordinate is a flat output: z follows
-by Newton's method, ż and z̈ by implicit differentiation, exactly, and the rows with input give u.
+**Flat.** The rows of the inverse model (17) without input must vanish. Given the referenced coordinates and
+their derivatives they are equations for the other coordinates: for their velocities where those are cyclic
+(the current of a motor), for their positions where not (the charge of an actuator). Where there are as many
+of these equations as unknowns z, and they contain no derivative of z, what is referenced is a flat output: z
+follows by Newton's method, ż and z̈ by implicit differentiation, exactly, and the rows with input give u.
 
 **Steady.** Any other system is given a rest for each value of the reference: accelerations 0, velocities of
 the other coordinates 0 save those of cyclic ones; what remains unknown, with the input, is fitted by least
@@ -16,6 +16,7 @@ Control 61 (1995).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -36,8 +37,9 @@ class Inversion:
     Args:
         flat: whether the whole state and input follow exactly; if not, they are those of a rest.
         reason: why so, in a sentence.
-        equations: (y, z) → (r, ∂r/∂z), with y = (q_c, q̇_c, …, up to ORDERS).
-        completion: (y, z) → (x, u).
+        equations: (y, z, f) → (r, ∂r/∂z), with y = (q_c, q̇_c, …, up to ORDERS) for each referenced
+            coordinate c, one after the other, and f the constant force on each coordinate.
+        completion: (y, z, f) → (x, u).
         unknowns: how z reads off a state x and input u: indices into (x, u).
     """
 
@@ -48,22 +50,22 @@ class Inversion:
     unknowns: tuple[int, ...]
 
 
-def invert(system: LagrangianSystem, coordinate: int, velocity: bool) -> Inversion:
-    """The best inversion there is for a system and the coordinate that is to follow a reference.
+def invert(system: LagrangianSystem, coordinates: Sequence[int], velocities: Sequence[bool]) -> Inversion:
+    """The best inversion there is for a system and the coordinates that are to follow a reference.
 
     Args:
         system: the model.
-        coordinate: index of the coordinate.
-        velocity: whether its velocity is referenced rather than its position.
+        coordinates: indices of the coordinates.
+        velocities: whether the velocity of each is referenced rather than its position.
     """
-    found = _flat(system, coordinate)
-    return found if isinstance(found, Inversion) else _steady(system, coordinate, velocity, found)
+    found = _flat(system, coordinates)
+    return found if isinstance(found, Inversion) else _steady(system, coordinates, velocities, found)
 
 
-def _flat(system: LagrangianSystem, c: int) -> Inversion | str:
+def _flat(system: LagrangianSystem, referenced: Sequence[int]) -> Inversion | str:
     """The inversion of a flat system, or the reason why it is none."""
     n = system.n
-    others = [i for i in range(n) if i != c]
+    others = [i for i in range(n) if i not in referenced]
     driven = [i for i in range(n) if system.coordinates[i].input is not None]
     free = [i for i in range(n) if i not in driven]
     if len(free) != len(others):
@@ -73,14 +75,16 @@ def _flat(system: LagrangianSystem, c: int) -> Inversion | str:
         return "some of the other coordinates are cyclic and some are not"
     level = 1 if cyclic == {True} else 0  # which derivative of the other coordinates is the unknown z
 
-    y = ca.SX.sym("y", ORDERS + 1)
+    orders = ORDERS + 1
+    y, f = ca.SX.sym("y", orders * len(referenced)), ca.SX.sym("f", n)
     z = [ca.SX.sym(f"z{k}", len(others)) for k in range(3)]  # z, ż, z̈
     motion = [ca.SX.zeros(n) for _ in range(3)]  # q, q̇, q̈
     for k in range(3):
-        motion[k][c] = y[k]
+        for j, c in enumerate(referenced):
+            motion[k][c] = y[j * orders + k]
         for j, i in enumerate(others):
             motion[k][i] = z[k - level][j] if k >= level else 0
-    force = system.inverse(*motion, system.parameter_values)
+    force = _forces(system, motion[0], motion[1], motion[2], f)
     equations = force[free]
     if others and ca.depends_on(equations, ca.vertcat(z[1], z[2])):
         return "the equations without input contain derivatives of the other coordinates"
@@ -91,7 +95,7 @@ def _flat(system: LagrangianSystem, c: int) -> Inversion | str:
     x, u = _state(system, motion[0], motion[1]), force[driven]
     if others:
         # d/dt r(y, z) = 0 and d²/dt² r(y, z) = 0 are linear in ż and z̈, with the same matrix ∂r/∂z.
-        rate = ca.vertcat(y[1:], 0)
+        rate = ca.vertcat(*(ca.vertcat(part[1:], 0) for part in ca.vertsplit(y, orders)))
         drift = ca.jtimes(equations, y, rate)
         slope = drift + jacobian @ z[1]
         curvature = ca.jtimes(slope, y, rate) + ca.jtimes(slope, z[0], z[1])
@@ -102,24 +106,28 @@ def _flat(system: LagrangianSystem, c: int) -> Inversion | str:
     names = [system.coordinates[i].velocity if level else system.coordinates[i].name for i in others]
     return Inversion(
         True,
-        "the referenced coordinate is a flat output of the model",
-        ca.Function("equations", [y, z[0]], [ca.densify(equations), ca.densify(jacobian)]),
-        _completion(y, z[0], x, u),
+        "what is referenced is a flat output of the model",
+        ca.Function("equations", [y, z[0], f], [ca.densify(equations), ca.densify(jacobian)]),
+        _completion(y, z[0], f, x, u),
         tuple(kept.index(name) for name in names),
     )
 
 
-def _steady(system: LagrangianSystem, c: int, velocity: bool, reason: str) -> Inversion:
+def _steady(
+    system: LagrangianSystem, referenced: Sequence[int], velocities: Sequence[bool], reason: str
+) -> Inversion:
     """The inversion that gives a rest for each value of the reference."""
     n, kept, m = system.n, system.state_names, len(system.input_names)
-    y, q, v = ca.SX.sym("y", ORDERS + 1), ca.SX.zeros(n), ca.SX.zeros(n)
-    q[c] = y[0]
-    if velocity:
-        v[c] = y[1]
+    y, f = ca.SX.sym("y", (ORDERS + 1) * len(referenced)), ca.SX.sym("f", n)
+    q, v = ca.SX.zeros(n), ca.SX.zeros(n)
+    for j, (c, velocity) in enumerate(zip(referenced, velocities, strict=True)):
+        q[c] = y[j * (ORDERS + 1)]
+        if velocity:
+            v[c] = y[j * (ORDERS + 1) + 1]
     unknown: list[Symbol] = []
     names: list[str] = []
     for i, coordinate in enumerate(system.coordinates):
-        if i == c:
+        if i in referenced:
             continue
         symbol = ca.SX.sym(coordinate.name)
         cyclic = coordinate.topology == "cyclic"
@@ -128,14 +136,19 @@ def _steady(system: LagrangianSystem, c: int, velocity: bool, reason: str) -> In
         names.append(coordinate.velocity if cyclic else coordinate.name)
     u = ca.SX.sym("u", m)
     z = ca.vertcat(*unknown, u)
-    residual = system.inverse(q, v, ca.SX.zeros(n), system.parameter_values) - system.input_matrix @ u
+    residual = _forces(system, q, v, ca.SX.zeros(n), f) - system.input_matrix @ u
     return Inversion(
         False,
         f"steady references: {reason}",
-        ca.Function("equations", [y, z], [ca.densify(residual), ca.densify(ca.jacobian(residual, z))]),
-        _completion(y, z, _state(system, q, v), u),
+        ca.Function("equations", [y, z, f], [ca.densify(residual), ca.densify(ca.jacobian(residual, z))]),
+        _completion(y, z, f, _state(system, q, v), u),
         (*(kept.index(name) for name in names), *(len(kept) + k for k in range(m))),
     )
+
+
+def _forces(system: LagrangianSystem, q: Symbol, v: Symbol, a: Symbol, f: Symbol) -> Symbol:
+    """What the inputs must bring for a motion, the force f helping: (17)."""
+    return system.inverse(q, v, a, system.parameter_values) - f
 
 
 def _state(system: LagrangianSystem, q: Symbol, v: Symbol) -> Symbol:
@@ -144,8 +157,8 @@ def _state(system: LagrangianSystem, q: Symbol, v: Symbol) -> Symbol:
     return ca.vertcat(q[kept], v)
 
 
-def _completion(y: Symbol, z: Symbol, x: Symbol, u: Symbol) -> ca.Function:
-    return ca.Function("completion", [y, z], ca.cse([ca.densify(x), ca.densify(u)]))
+def _completion(y: Symbol, z: Symbol, f: Symbol, x: Symbol, u: Symbol) -> ca.Function:
+    return ca.Function("completion", [y, z, f], ca.cse([ca.densify(x), ca.densify(u)]))
 
 
 class Inverter:
@@ -165,27 +178,30 @@ class Inverter:
         self._completion = Batch(inversion.completion, count)
 
     def __call__(
-        self, y: Float[np.ndarray, "k o"], guess: Float[np.ndarray, "k z"]
+        self, y: Float[np.ndarray, "k o"], guess: Float[np.ndarray, "k z"], force: Float[np.ndarray, " c"]
     ) -> tuple[Float[np.ndarray, "k z"], Float[np.ndarray, "k x"], Float[np.ndarray, "k u"]]:
         """Unknowns, states and inputs along the trajectory.
 
         Args:
-            y: referenced position and its derivatives, shape (count, ORDERS + 1).
+            y: referenced positions and their derivatives, shape (count, references · (ORDERS + 1)).
             guess: start of the iteration, shape (count, unknowns).
+            force: constant force on each coordinate.
 
         Returns:
             z, x and u; where there is no solution z is the guess, and nothing is ever infinite or NaN.
         """
-        z, solved = self._solve(y, guess)
+        z, solved = self._solve(y, guess, force)
         if not solved.all():
             # A guess at rest can be a singular point (force ∝ i² at i = 0): try from a generic one.
-            again, more = self._solve(y, np.ones_like(guess))
+            again, more = self._solve(y, np.ones_like(guess), force)
             z = np.where((more & ~solved)[:, None], again, np.where(solved[:, None], z, guess))
-        x, u = (np.nan_to_num(r[:, :, 0], nan=0.0, posinf=0.0, neginf=0.0) for r in self._completion(y, z))
+        x, u = (
+            np.nan_to_num(r[:, :, 0], nan=0.0, posinf=0.0, neginf=0.0) for r in self._completion(y, z, force)
+        )
         return z, x, u
 
     def _solve(
-        self, y: Float[np.ndarray, "k o"], guess: Float[np.ndarray, "k z"]
+        self, y: Float[np.ndarray, "k o"], guess: Float[np.ndarray, "k z"], force: Float[np.ndarray, " c"]
     ) -> tuple[Float[np.ndarray, "k z"], Bool[np.ndarray, " k"]]:
         """Gauss–Newton with steps of least norm, and where it ended in a solution."""
         z = guess.copy()
@@ -193,7 +209,7 @@ class Inverter:
         for _ in range(self.ITERATIONS):
             if converged.all():
                 break
-            result, jacobian = self._equations(y, z)
+            result, jacobian = self._equations(y, z, force)
             residual = result[:, :, 0]
             usable = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
             if not usable.any():
@@ -204,6 +220,6 @@ class Inverter:
             converged = usable & (np.abs(step).max(axis=1) <= self.TOLERANCE * (1.0 + np.abs(z).max(axis=1)))
         if self._flat and z.shape[1]:
             # A step of 0 at a singular point solves nothing.
-            residual, _ = self._equations(y, z)
+            residual, _ = self._equations(y, z, force)
             converged &= np.abs(residual).max(axis=(1, 2)) <= 1e-7 * (1.0 + np.abs(y).max(axis=1))
         return z, converged

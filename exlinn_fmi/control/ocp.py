@@ -20,7 +20,7 @@ model error.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -55,12 +55,14 @@ class Targets:
         u: reference inputs, shape (N, m): u* within the input bounds, or 0.
         P: terminal weight, shape (n, n).
         riccati: whether P solves the Riccati equation.
+        force: constant generalised force on each coordinate besides the inputs, shape (coordinates,).
     """
 
     x: NDArray[np.float64]
     u: NDArray[np.float64]
     P: NDArray[np.float64]
     riccati: bool
+    force: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ class Ocp:
         system: the prediction model.
         options: horizon, cost, weights and bounds.
         step: length of an interval [s].
-        reference: index of the referenced state.
+        referenced: indices of the referenced states.
 
     Raises:
         ModelError: names in `options` that the model does not have, or bounds that exclude each other.
@@ -117,46 +119,57 @@ class Ocp:
         system: LagrangianSystem,
         options: Nmpc,
         step: float,
-        reference: int,
+        referenced: Sequence[int],
     ) -> None:
         self.system, self.step, self.horizon = system, step, options.horizon
         self.n, self.m = len(system.state_names), len(system.input_names)
         if not self.m:
             raise ModelError("the model has no input that the controller could move")
         self.paper = options.cost == "paper"
-        weights, referenced = options.weights, np.eye(self.n)[reference]
-        self.Q = np.diag(_numbers("weights.states", weights.states, system.state_names, referenced))
+        weights, chosen = options.weights, np.isin(np.arange(self.n), referenced).astype(float)
+        self.Q = np.diag(_numbers("weights.states", weights.states, system.state_names, chosen))
         self.R = np.diag(_numbers("weights.inputs", weights.inputs, system.input_names, np.ones(self.m)))
         self.terminal = weights.terminal
         self.limits = _limits(options, system)
         largest = max(self.Q.max(), self.R.max())
         self.l1 = PENALTY * largest * self.limits.span
         self.l2 = PENALTY * largest * np.ones_like(self.limits.span)
-        self.discrete = system.rk4(options.substeps)
-        sensitivities = rk4_sensitivities(system, options.substeps)
+        loaded = system.loaded()
+        sensitivities = rk4_sensitivities(loaded, options.substeps)
         self._linearise = Batch(sensitivities, self.horizon)
         self._linearise_one = Batch(sensitivities, 1)
+        self.discrete = loaded.rk4(options.substeps)
+        """One interval of the prediction: (x, u, p, h) → x⁺, with `parameters(force)` as p."""
         self._predict = Batch(self.discrete, self.horizon)
-        self._p = system.parameter_values
+
+    def parameters(self, force: Float[np.ndarray, " c"]) -> Float[np.ndarray, " p"]:
+        """Parameters of the prediction: the model's own, then the force on each coordinate."""
+        return np.concatenate([self.system.parameter_values, force])
 
     def predict(
-        self, x: Float[np.ndarray, "nodes n"], u: Float[np.ndarray, "intervals m"]
+        self,
+        x: Float[np.ndarray, "nodes n"],
+        u: Float[np.ndarray, "intervals m"],
+        force: Float[np.ndarray, " c"],
     ) -> Float[np.ndarray, "intervals n"]:
         """Where each interval ends that begins at x_k with input u_k, shape (N, n)."""
-        return self._predict(x[:-1], u, self._p, self.step)[0][:, :, 0].copy()
+        return self._predict(x[:-1], u, self.parameters(force), self.step)[0][:, :, 0].copy()
 
     def linearise(
-        self, x: Float[np.ndarray, "nodes n"], u: Float[np.ndarray, "intervals m"]
+        self,
+        x: Float[np.ndarray, "nodes n"],
+        u: Float[np.ndarray, "intervals m"],
+        force: Float[np.ndarray, " c"],
     ) -> Linearisation:
         """The linearisation of all intervals at a plan."""
-        following, A, B = self._linearise(x[:-1], u, self._p, self.step)
+        following, A, B = self._linearise(x[:-1], u, self.parameters(force), self.step)
         return Linearisation(following[:, :, 0].copy(), A.copy(), B.copy())
 
     def linearise_at(
-        self, x: Float[np.ndarray, " n"], u: Float[np.ndarray, " m"]
+        self, x: Float[np.ndarray, " n"], u: Float[np.ndarray, " m"], force: Float[np.ndarray, " c"]
     ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n m"]]:
         """A and B of one interval at a state (n,) and input (m,)."""
-        _, A, B = self._linearise_one(x, u, self._p, self.step)
+        _, A, B = self._linearise_one(x, u, self.parameters(force), self.step)
         return A[0].copy(), B[0].copy()
 
     def targets(self, references: References) -> Targets:
@@ -170,13 +183,13 @@ class Ocp:
         u = np.clip(references.u, lim.u_min, lim.u_max)
         P: NDArray[np.float64] | None = None
         if self.terminal == "dare":
-            A, B = self.linearise_at(x[-1], u[-1])
+            A, B = self.linearise_at(x[-1], u[-1], references.force)
             # An input without weight would leave R singular.
             R = np.maximum(self.R, np.eye(self.m) * 1e-12 * max(1.0, self.Q.max()))
             P = solve_dare(A, B, self.Q, R)
         factor = FALLBACK_TERMINAL if self.terminal == "dare" else self.terminal
         target = np.zeros_like(u) if self.paper else u
-        return Targets(x, target, factor * self.Q if P is None else P, P is not None)
+        return Targets(x, target, factor * self.Q if P is None else P, P is not None, references.force)
 
     def cost(
         self, x: Float[np.ndarray, "nodes n"], u: Float[np.ndarray, "intervals m"], targets: Targets
@@ -195,10 +208,13 @@ class Ocp:
         return float(stages + x[-1] @ P @ x[-1])
 
     def shift(
-        self, x: Float[np.ndarray, "nodes n"], u: Float[np.ndarray, "intervals m"]
+        self,
+        x: Float[np.ndarray, "nodes n"],
+        u: Float[np.ndarray, "intervals m"],
+        force: Float[np.ndarray, " c"],
     ) -> tuple[Float[np.ndarray, "nodes n"], Float[np.ndarray, "intervals m"]]:
         """A plan (x, u) moved on by one interval: the last input is held, and the model says where to."""
-        end = self._linearise_one(x[-1], u[-1], self._p, self.step)[0][0, :, 0]
+        end = self._linearise_one(x[-1], u[-1], self.parameters(force), self.step)[0][0, :, 0]
         last = end if np.isfinite(end).all() else x[-1]
         return np.vstack([x[1:], last]), np.vstack([u[1:], u[-1:]])
 

@@ -157,7 +157,7 @@ class GaussNewton(Solver):
         once = self.real_time and not cold
         weight, stats = 0.0, Stats()
         for iteration in range(1, self.iterations + 1):
-            at = self.ocp.linearise(plan.x, plan.u)
+            at = self.ocp.linearise(plan.x, plan.u, targets.force)
             if not all(np.isfinite(a).all() for a in (at.next, at.A, at.B)):
                 return failed(plan, Stats(iteration, message="the model's predictions are not finite"))
             step = self.qp.solve(self._stage_qp(plan, at, targets))
@@ -234,7 +234,7 @@ class GaussNewton(Solver):
         length = 1.0
         while True:
             trial = Plan(plan.x + length * step.dx, plan.u + length * step.du)
-            gaps = ocp.predict(trial.x, trial.u) - trial.x[1:]
+            gaps = ocp.predict(trial.x, trial.u, targets.force) - trial.x[1:]
             merit = ocp.cost(trial.x, trial.u, targets) + ocp.penalty(trial.x) + weight * np.abs(gaps).sum()
             enough = merit <= now + weight * gap + 1e-4 * length * slope + rounding
             # The shortest step is taken whatever it brings: standing still would end the iteration.
@@ -264,7 +264,8 @@ class Ipopt(Solver):
         self._split = np.cumsum([n * N, m * N])
         X, U, S = ca.MX.sym("x", n, N), ca.MX.sym("u", m, N), ca.MX.sym("s", s, N)
         x0, X_ref, U_ref = ca.MX.sym("x0", n), ca.MX.sym("x_ref", n, N + 1), ca.MX.sym("u_ref", m, N)
-        P, p = ca.MX.sym("P", n, n), ca.DM(ocp.system.parameter_values)
+        P, force = ca.MX.sym("P", n, n), ca.MX.sym("force", ocp.system.n)
+        p = ca.vertcat(ca.DM(ocp.system.parameter_values), force)
         before = ca.horzcat(x0, X[:, :-1])
         following = ocp.discrete.map(N)(before, U, ca.repmat(p, 1, N), ocp.step)
         e, d = before - X_ref[:, :-1], U - U_ref
@@ -278,7 +279,7 @@ class Ipopt(Solver):
             "ipopt",
             {
                 "x": ca.vertcat(*(ca.vec(a) for a in (X, U, S))),
-                "p": ca.vertcat(*(ca.vec(a) for a in (x0, X_ref, U_ref, P))),
+                "p": ca.vertcat(*(ca.vec(a) for a in (x0, X_ref, U_ref, P, force))),
                 "f": cost,
                 "g": ca.vertcat(*(ca.vec(a) for a in constraints)),
             },
@@ -310,7 +311,9 @@ class Ipopt(Solver):
     def _solve(self, plan: Plan, targets: Targets, cold: bool) -> Solution:
         violations = self.ocp.violations(plan.x)
         start = np.concatenate([plan.x[1:].ravel(), plan.u.ravel(), violations.ravel()])
-        p = np.concatenate([plan.x[0], targets.x.ravel(), targets.u.ravel(), targets.P.ravel()])
+        p = np.concatenate(
+            [plan.x[0], targets.x.ravel(), targets.u.ravel(), targets.P.ravel(), targets.force]
+        )
         try:
             result = self._solver(x0=start, p=p, **self._bounds)
         except RuntimeError as error:  # CasADi's only way to report a callback that went wrong

@@ -54,6 +54,11 @@ class Coordinate:
         """Unit of q̈: rad/s → rad/s2, m/s → m/s2, A → A/s."""
         return f"{self.velocity_unit}2" if self.velocity_unit.endswith("/s") else f"{self.velocity_unit}/s"
 
+    @property
+    def force_unit(self) -> str:
+        """Unit of the generalised force on q, J over that of q: m → N, rad → N.m, C → V."""
+        return self.input_unit or {"m": "N", "rad": "N.m", "C": "V"}.get(self.unit, f"J/{self.unit}")
+
 
 @dataclass(frozen=True)
 class Parameter:

@@ -130,6 +130,25 @@ class LagrangianSystem:
             lambda v, none: self.dissipation(v, p),
         )
 
+    def loaded(self) -> LagrangianSystem:
+        """The same system under a constant generalised force on every coordinate: n parameters more, all 0.
+
+        A force f is what −fᵀq̇ in the dissipation makes of it in (11), on cyclic coordinates too.
+        """
+        _, v, _, _, p = self._symbols
+        q, force = ca.SX.sym("q", self.n), ca.SX.sym("f", self.n)
+        longer = ca.vertcat(p, force)
+        loss = self.dissipation(v, p) - ca.dot(force, v)
+        return replace(
+            self,
+            lagrangian=ca.Function("L", [q, v, longer], [self.lagrangian(q, v, p)], ["q", "v", "p"], ["L"]),
+            dissipation=ca.Function("D", [v, longer], [loss], ["v", "p"], ["D"]),
+            parameters=(
+                *self.parameters,
+                *(Parameter(f"force_{c.name}", 0.0, c.force_unit, "force") for c in self.coordinates),
+            ),
+        )
+
     # ── names and sizes ──────────────────────────────────────────────────────────────────────────────────
 
     @property

@@ -93,7 +93,12 @@ def control_chart(trajectories: Table, loop: Loop, several: bool) -> Chart | Non
     """Cost, inputs, tracked output and states against their references, solve time: the paper's Fig. 4."""
     frame = trajectories.frame
     rows = loop.samples(_values(frame, "time"))
-    output = loop.output if loop.output not in loop.states.values() else None
+    measured = loop.states.values()
+    outputs = [
+        _tracked_panel(trajectories, loop, output, loop.own(reference))
+        for reference, output in loop.outputs.items()
+        if output not in measured
+    ]
     states = [
         _tracked_panel(trajectories, loop, path, loop.reference_of(name), loop.settings.states.get(name))
         for name, path in loop.states.items()
@@ -101,7 +106,7 @@ def control_chart(trajectories: Table, loop: Loop, several: bool) -> Chart | Non
     panels = [
         _cost_panel(trajectories, loop, rows),
         *(_input_panel(trajectories, loop, name, path) for name, path in loop.inputs.items()),
-        _tracked_panel(trajectories, loop, output, loop.own("reference")) if output else None,
+        *outputs,
         *states,
         _solve_time_panel(trajectories, loop, rows),
     ]

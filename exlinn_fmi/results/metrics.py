@@ -34,7 +34,8 @@ class Loop:
         settings: its part of the scenario.
         inputs: plant input by name of the controller's output that drives it.
         states: plant variable by name of the model state that it is measured for.
-        output: plant variable that should follow the reference, None where that is not known.
+        outputs: plant variable that should follow a reference, by the name of the controller's output that
+            tells the reference, as far as that is known.
     """
 
     controller: str
@@ -44,7 +45,7 @@ class Loop:
     settings: Nmpc
     inputs: Mapping[str, str]
     states: Mapping[str, str]
-    output: str | None
+    outputs: Mapping[str, str]
 
     def own(self, output: str) -> str:
         """Path of one of the controller's outputs."""
@@ -109,7 +110,7 @@ def control_loops(scenario: Scenario) -> list[Loop]:
                 settings=component.nmpc,
                 inputs=inputs,
                 states=states,
-                output=_tracked(scenario, component.nmpc, inputs, states),
+                outputs=_tracked(scenario, component.nmpc, inputs, states),
             )
         )
     return loops
@@ -166,31 +167,32 @@ def outside(values: NDArray[np.float64], bounds: Bounds) -> NDArray[np.bool_]:
 
 def _tracked(
     scenario: Scenario, settings: Nmpc, inputs: Mapping[str, str], states: Mapping[str, str]
-) -> str | None:
-    """The plant variable that follows the controller's `reference`."""
-    named = scenario.metrics.output
+) -> dict[str, str]:
+    """The plant variables that follow the controller's references."""
     neighbours = {path.split(".", 1)[0] for path in (*inputs.values(), *states.values())}
-    if named is not None and named.split(".", 1)[0] in neighbours:
-        return named
-    reference = settings.reference
-    return states.get(reference.coordinate) if reference.through is None else None
+    named = [path for path in scenario.metrics.outputs if path.split(".", 1)[0] in neighbours]
+    if named:
+        return dict(zip(settings.references, named, strict=False))
+    return {
+        name: states[reference.coordinate]
+        for name, reference in settings.references.items()
+        if reference.through is None and reference.coordinate in states
+    }
 
 
 def _tracking(frame: pd.DataFrame, loop: Loop, units: Mapping[str, str]) -> dict[str, float]:
-    """Root mean square and largest distance of the output from its reference, after settling."""
-    reference = loop.own("reference")
-    if loop.output is None or not {loop.output, reference} <= set(frame.columns):
-        return {}
+    """Root mean square and largest distance of each output from its reference, after settling."""
     time = frame["time"].to_numpy(dtype=float)
     rows = loop.samples(time) & (time >= loop.settled - 1e-6 * loop.period)
-    error = (frame[loop.output] - frame[reference]).to_numpy(dtype=float)[rows]
-    if not error.size:
-        return {}
-    name = quantity(loop.output, units.get(loop.output) or "")
-    return {
-        f"rmse_{name}": float(np.sqrt(np.mean(error**2))),
-        f"max_error_{name}": float(np.max(np.abs(error))),
-    }
+    metrics: dict[str, float] = {}
+    for reference, output in loop.outputs.items():
+        if not rows.any() or not {output, loop.own(reference)} <= set(frame.columns):
+            continue
+        error = (frame[output] - frame[loop.own(reference)]).to_numpy(dtype=float)[rows]
+        name = quantity(output, units.get(output) or "")
+        metrics[f"rmse_{name}"] = float(np.sqrt(np.mean(error**2)))
+        metrics[f"max_error_{name}"] = float(np.max(np.abs(error)))
+    return metrics
 
 
 def _violations(frame: pd.DataFrame, loop: Loop) -> dict[str, float]:

@@ -80,11 +80,12 @@ def describe(run: RunFiles, key: str) -> tuple[str, str]:
                 suffix, loops = f" ({loop.controller})", [loop]
                 break
     for loop in loops:
-        unit = run.trajectories.unit(loop.output) if run.trajectories and loop.output else ""
-        name = quantity(loop.output, unit) if loop.output else ""
-        if name and key in (f"control.rmse_{name}", f"control.max_error_{name}"):
-            kind = "root mean square" if ".rmse_" in key else "largest"
-            return f"Tracking error of {loop.output}, {kind}{suffix}", unit
+        for output in loop.outputs.values():
+            unit = run.trajectories.unit(output) if run.trajectories else ""
+            name = quantity(output, unit)
+            if key in (f"control.rmse_{name}", f"control.max_error_{name}"):
+                kind = "root mean square" if ".rmse_" in key else "largest"
+                return f"Tracking error of {output}, {kind}{suffix}", unit
         for name, path in loop.inputs.items():
             if key in ("control.input_rms", f"control.input_rms_{name}"):
                 unit = run.trajectories.unit(path) if run.trajectories else ""

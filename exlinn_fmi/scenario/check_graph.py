@@ -139,13 +139,14 @@ def recorded(survey: Survey) -> Iterator[Finding]:
         if problem:
             yield ("simulate", "record", k), problem
     metrics = survey.scenario.metrics
-    if metrics.output is not None:
-        variable, problem = survey.find(metrics.output, "output")
+    several = isinstance(metrics.output, list)
+    for k, output in enumerate(metrics.outputs):
+        variable, problem = survey.find(output, "output")
         if simulate is not None and variable is not None:
-            recorded = any(records(pattern, metrics.output, variable) for pattern in patterns)
-            problem = None if recorded else f"{metrics.output} is not recorded; add it to simulate.record"
+            recorded = any(records(pattern, output, variable) for pattern in patterns)
+            problem = None if recorded else f"{output} is not recorded; add it to simulate.record"
         if problem:
-            yield ("metrics", "output"), problem
+            yield ("metrics", "output", k) if several else ("metrics", "output"), problem
 
 
 def records(pattern: str, path: str, variable: Variable) -> bool:

@@ -10,7 +10,7 @@ from exlinn_fmi.components.base import Variable
 from exlinn_fmi.errors import DataError, ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate, check_coordinates
 from exlinn_fmi.scenario.check_graph import is_multiple, misfit_starts, no_multiple
-from exlinn_fmi.scenario.control import Nmpc
+from exlinn_fmi.scenario.control import Nmpc, Reference
 from exlinn_fmi.scenario.explain import Finding
 from exlinn_fmi.scenario.learning import (
     AnyLearn,
@@ -38,8 +38,8 @@ def signals(survey: Survey) -> Iterator[Finding]:
         if isinstance(spec, SignalComponent):
             yield from _signal(("components", name, "source"), spec.source, survey.folder)
         if isinstance(spec, NmpcComponent):
-            trajectory: KeyPath = ("components", name, "nmpc", "reference", "trajectory")
-            yield from _signal(trajectory, spec.nmpc.reference.trajectory, survey.folder)
+            for at, reference in _references(("components", name, "nmpc"), spec.nmpc):
+                yield from _signal((*at, "trajectory"), reference.trajectory, survey.folder)
     for at, experiment in _experiments(survey.scenario.learn):
         for target, signal in experiment.inputs.items():
             yield from _signal((*at, "inputs", target), signal, survey.folder)
@@ -233,10 +233,11 @@ def control(survey: Survey) -> Iterator[Finding]:
                 yield from _learned((*at, "nmpc", "model"), survey)
             known = survey.variables.get(name)
             states = inputs = None
-            if known is not None and "reference" in known:
+            first = next(iter(spec.nmpc.references))
+            if known is not None and first in known:
                 states = {v.name: v for v in known.values() if v.causality == "input"}
                 outputs = [v.name for v in known.values() if v.causality == "output"]
-                inputs = outputs[: outputs.index("reference")]
+                inputs = outputs[: outputs.index(first)]
             yield from _controller((*at, "nmpc"), spec.nmpc, states, inputs)
 
 
@@ -272,12 +273,20 @@ def _controller(
         given = getattr(weights, key)
         if isinstance(given, dict):
             yield from _unknown((*at, "weights", key), given, known, key)
-    reference = nmpc.reference
-    yield from _unknown((*at, "reference", "coordinate"), [reference.coordinate], states, "states")
-    state, unit = states.get(reference.coordinate), reference.trajectory.unit
-    if state is not None and reference.through is None and not same_unit(unit, state.unit):
-        message = f"unit mismatch: trajectory [{unit}] → {state.name} [{state.unit}]"
-        yield (*at, "reference", "trajectory"), f"{message}; give the kinematics as `through`"
+    for here, reference in _references(at, nmpc):
+        yield from _unknown((*here, "coordinate"), [reference.coordinate], states, "states")
+        state, unit = states.get(reference.coordinate), reference.trajectory.unit
+        if state is not None and reference.through is None and not same_unit(unit, state.unit):
+            message = f"unit mismatch: trajectory [{unit}] → {state.name} [{state.unit}]"
+            yield (*here, "trajectory"), f"{message}; give the kinematics as `through`"
+
+
+def _references(at: KeyPath, nmpc: Nmpc) -> Iterator[tuple[KeyPath, Reference]]:
+    """What a controller follows, with where it stands."""
+    if isinstance(nmpc.reference, Reference):
+        yield (*at, "reference"), nmpc.reference
+    else:
+        yield from (((*at, "reference", k), spec) for k, spec in enumerate(nmpc.reference))
 
 
 def _unknown(at: KeyPath, given: Iterable[str], known: Iterable[str], kind: str) -> Iterator[Finding]:

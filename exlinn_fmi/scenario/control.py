@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+from annotated_types import Len
 from pydantic import Discriminator, Field, Tag
 
 from exlinn_fmi.scenario.signals import Signal
@@ -67,7 +68,10 @@ class Nmpc(Spec):
         description="`learned`: what this scenario's `learn` trains; `plant:NAME`: a plant of ours; "
         "else a folder with model.json",
     )
-    reference: Reference = Field(description="what to follow")
+    reference: Annotated[
+        Annotated[Reference, Tag("a mapping")] | Annotated[list[Reference], Tag("a list"), Len(1)],
+        Discriminator(form),
+    ] = Field(description="what to follow; a list for several coordinates")
     horizon: int = Field(30, ge=1, le=10_000, description="N_p, number of intervals")
     cost: Literal["tracking", "paper"] = Field(
         "tracking",
@@ -89,3 +93,10 @@ class Nmpc(Spec):
         default_factory=dict,
         description="input to fall back to when there is no plan left, by name; 0 if not given",
     )
+
+    @property
+    def references(self) -> dict[str, Reference]:
+        """What to follow by the name of the output that tells it: `reference`, or `reference_1` and so on."""
+        if isinstance(self.reference, Reference):
+            return {"reference": self.reference}
+        return {f"reference_{k}": spec for k, spec in enumerate(self.reference, 1)}

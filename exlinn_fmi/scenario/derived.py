@@ -57,14 +57,16 @@ def nmpc_variables(coordinates: tuple[Coordinate, ...], options: Nmpc) -> tuple[
     def output(name: str, unit: str | None, text: str, type_: VariableType = "Real") -> Variable:
         return Variable(name, "output", "discrete", unit, type_, description=text, depends_on=names)
 
-    quantity = reference_unit(options.reference, dict(states))
     return (
         *(
             Variable(name, "input", "continuous", unit, start=0.0, description=f"measured {name}")
             for name, unit in states
         ),
         *(output(c.input, c.input_unit or None, "input to apply") for c in coordinates if c.input),
-        output("reference", quantity, "what is to be followed"),
+        *(
+            output(name, reference_unit(reference, dict(states)), "what is to be followed")
+            for name, reference in options.references.items()
+        ),
         *(output(f"reference_{name}", unit, f"reference of {name}") for name, unit in states),
         output("cost", "1", "cost J of the plan"),
         output("solve_status", "1", "0 solved, 1 iteration limit, 2 failed: fallback applied", "Enumeration"),

@@ -121,18 +121,24 @@ class Simulate(Spec):
     )
 
 
+Paths = Annotated[
+    Annotated[VariablePath, Tag("text")] | Annotated[list[VariablePath], Tag("a list")], Discriminator(form)
+]
+
+
 class Metrics(Spec):
     """How the closed loop is judged."""
 
     settle: NonNegative = Field(0.0, description="time at the start that the errors leave out [s]")
-    output: VariablePath | None = Field(
-        None, description="recorded variable that is compared with the reference's quantity"
+    output: Paths | None = Field(
+        None,
+        description="recorded variable that is compared with the reference's quantity; a list for several",
     )
 
-
-Targets = Annotated[
-    Annotated[VariablePath, Tag("text")] | Annotated[list[VariablePath], Tag("a list")], Discriminator(form)
-]
+    @property
+    def outputs(self) -> list[str]:
+        """The variables, in the order of the references."""
+        return self.output if isinstance(self.output, list) else [self.output] if self.output else []
 
 
 class Scenario(Spec):
@@ -146,7 +152,7 @@ class Scenario(Spec):
     components: dict[Name, ComponentSpec] = Field(
         default_factory=dict, description="what takes part, by name"
     )
-    connections: dict[VariablePath, Targets] = Field(
+    connections: dict[VariablePath, Paths] = Field(
         default_factory=dict, description="from: to, or from: [to, to], each component.variable"
     )
     learn: AnyLearn | None = Field(None, description="learn a model of one component, or of measured data")

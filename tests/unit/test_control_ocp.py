@@ -21,7 +21,7 @@ from exlinn_fmi.scenario.spec import Bounds
 
 def ocp(system: LagrangianSystem, **options) -> Ocp:
     spec = Nmpc(**({"reference": CART} | options))
-    return Ocp(system, spec, STEP, system.state_names.index(spec.reference.coordinate))
+    return Ocp(system, spec, STEP, [system.state_names.index(spec.reference.coordinate)])
 
 
 # ── Riccati ──────────────────────────────────────────────────────────────────────────────────────────────
@@ -71,27 +71,27 @@ def test_linearisation_follows_a_small_change_of_the_plan():
     made, rng = ocp(motor_cart()), np.random.default_rng(0)
     x, u = rng.normal(size=(31, 3)), rng.normal(size=(30, 1))
     dx, du = 1e-5 * rng.normal(size=(31, 3)), 1e-5 * rng.normal(size=(30, 1))
-    at = made.linearise(x, u)
+    at = made.linearise(x, u, np.zeros(2))
     change = np.einsum("kij,kj->ki", at.A, dx[:-1]) + np.einsum("kij,kj->ki", at.B, du)
-    np.testing.assert_allclose(made.predict(x + dx, u + du) - at.next, change, atol=1e-11)
-    np.testing.assert_array_equal(made.predict(x, u), at.next)
+    np.testing.assert_allclose(made.predict(x + dx, u + du, np.zeros(2)) - at.next, change, atol=1e-11)
+    np.testing.assert_array_equal(made.predict(x, u, np.zeros(2)), at.next)
 
 
 def test_results_of_a_linearisation_survive_the_next_one():
     made = ocp(motor_cart())
-    first = made.linearise(np.zeros((31, 3)), np.zeros((30, 1)))
+    first = made.linearise(np.zeros((31, 3)), np.zeros((30, 1)), np.zeros(2))
     kept = first.A.copy()
-    made.linearise(np.ones((31, 3)), np.ones((30, 1)))
+    made.linearise(np.ones((31, 3)), np.ones((30, 1)), np.zeros(2))
     np.testing.assert_array_equal(first.A, kept)
 
 
 def test_a_shifted_plan_begins_one_interval_later_and_ends_where_the_model_says():
     made = ocp(oscillator(), reference=constant("x", 0.0), horizon=3)
     x, u = np.arange(8.0).reshape(4, 2), np.arange(3.0)[:, None]
-    later_x, later_u = made.shift(x, u)
+    later_x, later_u = made.shift(x, u, np.zeros(1))
     np.testing.assert_array_equal(later_x[:3], x[1:])
     np.testing.assert_array_equal(later_u[:, 0], [1.0, 2.0, 2.0])
-    np.testing.assert_allclose(later_x[3], evaluate(made.discrete, x[3], u[2], [], [STEP])[0])
+    np.testing.assert_allclose(later_x[3], evaluate(made.discrete, x[3], u[2], [0.0], [STEP])[0])
 
 
 # ── cost ─────────────────────────────────────────────────────────────────────────────────────────────────
@@ -99,7 +99,7 @@ def test_a_shifted_plan_begins_one_interval_later_and_ends_where_the_model_says(
 
 def test_cost_is_that_of_equation_13_without_a_last_input():
     made = ocp(oscillator(), reference=constant("x", 0.0), horizon=2, cost="paper")
-    targets = made.targets(generator(oscillator(), constant("x", 0.0), 2).over(0.0, np.zeros(2), 0))
+    targets = made.targets(generator(oscillator(), constant("x", 0.0), 2).over(0.0, np.zeros(2), (0,)))
     x, u = np.array([[1.0, 9.0], [2.0, 9.0], [3.0, 4.0]]), np.array([[5.0], [6.0]])
     end = x[2] @ targets.P @ x[2]
     assert made.cost(x, u, targets) == pytest.approx(10 * (1 + 4) + 1e-3 * (25 + 36) + end)
@@ -116,16 +116,16 @@ def test_weights_by_name_are_taken_as_they_are():
 
 
 def test_cost_of_the_paper_weighs_the_whole_input_and_tracking_its_deviation():
-    references = generator(motor_cart()).over(0.0, np.array([np.pi / 2, 0.0, 0.0]), 0)
+    references = generator(motor_cart()).over(0.0, np.array([np.pi / 2, 0.0, 0.0]), (0,))
     assert np.all(ocp(motor_cart(), cost="paper").targets(references).u == 0.0)
     np.testing.assert_array_equal(ocp(motor_cart()).targets(references).u, references.u)
 
 
 def test_terminal_weight_solves_the_riccati_equation_at_the_horizons_end():
     made = ocp(motor_cart())
-    references = generator(motor_cart()).over(0.0, np.array([np.pi / 2, 0.0, 0.0]), 0)
+    references = generator(motor_cart()).over(0.0, np.array([np.pi / 2, 0.0, 0.0]), (0,))
     targets = made.targets(references)
-    A, B = made.linearise_at(references.x[-1], references.u[-1])
+    A, B = made.linearise_at(references.x[-1], references.u[-1], np.zeros(2))
     expected = scipy.linalg.solve_discrete_are(A, B, made.Q, made.R)
     np.testing.assert_allclose(targets.P, expected, rtol=1e-8, atol=1e-8 * expected.max())
     assert targets.riccati
@@ -133,7 +133,7 @@ def test_terminal_weight_solves_the_riccati_equation_at_the_horizons_end():
 
 def test_terminal_weight_may_be_a_multiple_of_q():
     made = ocp(motor_cart(), weights=Weights(terminal=3.0))
-    targets = made.targets(generator(motor_cart()).over(0.0, np.zeros(3), 0))
+    targets = made.targets(generator(motor_cart()).over(0.0, np.zeros(3), (0,)))
     np.testing.assert_array_equal(targets.P, 3.0 * made.Q)
     assert not targets.riccati
 
@@ -146,14 +146,14 @@ def test_without_a_riccati_solution_the_terminal_weight_is_a_multiple_of_q():
         lambda v, p: 0.0 * v[0],
     )
     made = ocp(lost, reference=constant("b", 0.1))
-    targets = made.targets(generator(lost, constant("b", 0.1)).over(0.0, np.zeros(4), 0))
+    targets = made.targets(generator(lost, constant("b", 0.1)).over(0.0, np.zeros(4), (0,)))
     assert not targets.riccati
     np.testing.assert_array_equal(targets.P, FALLBACK_TERMINAL * made.Q)
 
 
 def test_an_input_without_weight_has_a_riccati_solution():
     made = ocp(motor_cart(), weights=Weights(inputs=0.0))
-    assert made.targets(generator(motor_cart()).over(0.0, np.zeros(3), 0)).riccati
+    assert made.targets(generator(motor_cart()).over(0.0, np.zeros(3), (0,))).riccati
 
 
 # ── bounds ───────────────────────────────────────────────────────────────────────────────────────────────
@@ -186,7 +186,7 @@ def test_violation_is_penalised_and_reported_over_the_range_of_the_bound():
 def test_references_are_kept_within_bounds():
     tight = {"inputs": {"v": Bounds(min=-1.0, max=1.0)}, "states": {"i": Bounds(min=-0.1, max=0.1)}}
     made = ocp(motor_cart(), **tight)
-    targets = made.targets(generator(motor_cart()).over(0.0, np.array([np.pi / 2, 0.0, 0.0]), 0))
+    targets = made.targets(generator(motor_cart()).over(0.0, np.array([np.pi / 2, 0.0, 0.0]), (0,)))
     assert np.abs(targets.u).max() <= 1.0
     assert np.abs(targets.x[:, 2]).max() <= 0.1
 

@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from control_helpers import (
+    CART,
     STEP,
     arm,
     constant,
@@ -42,7 +43,7 @@ def assert_follows_model(system: LagrangianSystem, made: References, step: float
 
 
 def test_flat_reference_of_the_motor_is_the_analytic_one():
-    made = generator(motor_cart()).over(0.35, START, 0)
+    made = generator(motor_cart()).over(0.35, START, (0,))
     time = ca.SX.sym("t")
     alpha = ca.acos(0.75 * ca.sin(2 * np.pi * 0.4 * time))
 
@@ -57,7 +58,7 @@ def test_flat_reference_of_the_motor_is_the_analytic_one():
     nodes, middles = 0.35 + STEP * np.arange(30), 0.35 + STEP * (np.arange(30) + 0.5)
     np.testing.assert_allclose(made.x[:30], exact(nodes)[0].full().T, atol=1e-10)
     np.testing.assert_allclose(made.u, exact(middles)[1].full().T, atol=1e-7)
-    assert made.quantity == pytest.approx(0.15 * np.sin(2 * np.pi * 0.4 * 0.35))
+    assert made.quantity[0] == pytest.approx(0.15 * np.sin(2 * np.pi * 0.4 * 0.35))
 
 
 @pytest.mark.parametrize(
@@ -74,7 +75,7 @@ def test_flat_reference_of_the_motor_is_the_analytic_one():
 def test_flat_references_obey_the_model(system, reference, start):
     made = generator(system, reference)
     assert made.inversion.flat
-    assert_follows_model(system, made.over(0.2, np.array(start), 0))
+    assert_follows_model(system, made.over(0.2, np.array(start), (0,)))
 
 
 @settings(max_examples=20, deadline=None)
@@ -88,30 +89,30 @@ def test_reference_stays_on_the_branch_of_the_measured_angle(start, time):
 
 def test_moving_on_by_a_step_gives_what_starting_anew_does():
     made = generator(motor_cart())
-    moved = made.over(0.0, START, 0)
+    moved = made.over(0.0, START, (0,))
     for k in range(1, 70):
-        moved = made.over(k * STEP, START, 0, moved)
-    anew = made.over(69 * STEP, START, 0)
+        moved = made.over(k * STEP, START, (0,), moved)
+    anew = made.over(69 * STEP, START, (0,))
     np.testing.assert_allclose(moved.grid_x, anew.grid_x, atol=1e-8)
     np.testing.assert_allclose(moved.grid_u, anew.grid_u, atol=1e-7)
 
 
 def test_another_time_or_branch_starts_anew():
     made = generator(motor_cart())
-    first = made.over(0.0, START, 0)
-    np.testing.assert_array_equal(made.over(0.5, START, 0, first).x, made.over(0.5, START, 0).x)
-    np.testing.assert_array_equal(made.over(STEP, START, 2, first).x, made.over(STEP, START, 2).x)
+    first = made.over(0.0, START, (0,))
+    np.testing.assert_array_equal(made.over(0.5, START, (0,), first).x, made.over(0.5, START, (0,)).x)
+    np.testing.assert_array_equal(made.over(STEP, START, (2,), first).x, made.over(STEP, START, (2,)).x)
 
 
 def test_position_of_a_referenced_speed_is_counted_from_the_measured_one():
-    made = generator(motor_cart(), constant("alpha_dot", 3.0)).over(0.0, np.array([7.0, 0.0, 0.0]), 0)
+    made = generator(motor_cart(), constant("alpha_dot", 3.0)).over(0.0, np.array([7.0, 0.0, 0.0]), (0,))
     np.testing.assert_allclose(made.grid_x[:, 0], 7.0 + 3.0 * STEP / 2 * np.arange(61))
 
 
 def test_reference_through_a_gear():
     through = Linear(map="linear", gain=0.5, offset=1.0)
     gear = constant("x", 3.0).model_copy(update={"through": through})
-    made = generator(oscillator(), gear).over(0.0, np.zeros(2), 0)
+    made = generator(oscillator(), gear).over(0.0, np.zeros(2), (0,))
     np.testing.assert_allclose(made.x, np.tile([4.0, 0.0], (31, 1)))
     np.testing.assert_allclose(made.u, 16.0)  # the spring's 4 N/m
 
@@ -131,7 +132,7 @@ def test_what_is_not_flat_gets_steady_references_and_says_so(system, reference, 
 
 def test_steady_reference_is_a_rest_of_the_model():
     system = arm()
-    made = generator(system, constant("a", 0.3)).over(0.0, np.zeros(4), 0)
+    made = generator(system, constant("a", 0.3)).over(0.0, np.zeros(4), (0,))
     np.testing.assert_allclose(made.x[:, 0], 0.3)
     np.testing.assert_allclose(made.x[:, 2:], 0.0)
     rate = evaluate(system.derivative, made.x[0], made.u[0], system.parameter_values)
@@ -163,7 +164,7 @@ def test_coordinates_that_nothing_links_are_not_flat():
 def test_unreachable_reference_is_finite():
     # No current pushes the ball away from the magnet at ten times its weight.
     wild = sine("x", 0.04, 0.05, frequency=8.0)
-    made = generator(levitation(), wild).over(0.0, np.array([0.05, 0.0, 1.0]), 0)
+    made = generator(levitation(), wild).over(0.0, np.array([0.05, 0.0, 1.0]), (0,))
     assert np.isfinite(made.grid_x).all()
     assert np.isfinite(made.grid_u).all()
 
@@ -174,13 +175,13 @@ def test_reference_of_a_model_that_is_not_finite_is_finite():
         lambda q, v, p: 0.5 * ca.sumsqr(v) + ca.sqrt(q[0] - 10) * v[1] ** 2,
         lambda v, p: 0.1 * ca.sumsqr(v),
     )
-    made = generator(broken, constant("x", 0.1)).over(0.0, np.zeros(3), 0)
+    made = generator(broken, constant("x", 0.1)).over(0.0, np.zeros(3), (0,))
     assert np.isfinite(made.grid_x).all()
 
 
 def test_steps_give_rests_on_both_sides():
     jump = Reference(coordinate="x", trajectory=Step(signal="step", time=0.1, before=0.0, after=1.0))
-    made = generator(oscillator(), jump).over(0.0, np.zeros(2), 0)
+    made = generator(oscillator(), jump).over(0.0, np.zeros(2), (0,))
     np.testing.assert_allclose(made.x[:, 1], 0.0, atol=1e-9)
     np.testing.assert_allclose(made.u[:, 0], np.where(np.arange(30) < 10, 0.0, 4.0), atol=1e-6)
 
@@ -190,7 +191,7 @@ def test_horizon_may_look_beyond_a_table_but_the_run_may_not(tmp_path):
     table = Table(signal="table", file="path.csv", column="y", outside="error")
     spec = Reference(coordinate="x", trajectory=table)
     made = ReferenceGenerator(oscillator(), spec, tmp_path, STEP, 30)
-    assert made.over(0.9, np.zeros(2), 0).x[-1, 0] == pytest.approx(1.0)
+    assert made.over(0.9, np.zeros(2), (0,)).x[-1, 0] == pytest.approx(1.0)
     made.check(0.0, 1.0)
     with pytest.raises(DataError):
         made.check(0.0, 2.0)
@@ -211,3 +212,36 @@ def test_gain_zero_cannot_be_inverted():
     flat = Linear(map="linear", gain=0.0)
     with pytest.raises(ModelError, match="gain: 0 cannot be inverted"):
         generator(motor_cart(), constant("alpha", 0.0).model_copy(update={"through": flat}))
+
+
+# ── several references, and a force besides the inputs ───────────────────────────────────────────────────
+
+
+def test_two_references_of_two_driven_coordinates_are_flat():
+    system, starts = arm(), np.array([0.3, -0.2, 0.0, 0.0])
+    made = generator(system, [sine("a", 0.3), sine("b", 0.2, 0.1)])
+    assert made.inversion.flat
+    references = made.over(0.2, starts, (0, 0))
+    assert_follows_model(system, references)
+    np.testing.assert_allclose(references.quantity, references.x[0, :2], atol=1e-12)
+
+
+def test_one_coordinate_cannot_follow_two_references():
+    with pytest.raises(ModelError, match="two references are for the same coordinate"):
+        generator(motor_cart(), [CART, constant("alpha_dot", 1.0)])
+
+
+def test_a_wrong_reference_among_several_is_told_by_its_number():
+    with pytest.raises(ModelError, match=r"reference\[1\].coordinate: the model has no state 'w'"):
+        generator(motor_cart(), [CART, constant("w", 1.0)])
+
+
+def test_the_reference_input_holds_against_a_constant_force():
+    made, force = generator(motor_cart()), np.array([0.3, -0.5])
+    free = made.over(0.0, START, (0,))
+    held = made.over(0.0, START, (0,), force=force)
+    # k_e i takes the torque over, and r i with the voltage goes with it.
+    np.testing.assert_allclose(held.grid_x[:, 2], free.grid_x[:, 2] - 0.3, atol=1e-9)
+    np.testing.assert_allclose(held.grid_u[:, 0], free.grid_u[:, 0] - 5.0 * 0.3 + 0.5, atol=1e-8)
+    moved = made.over(STEP, START, (0,), free, force)
+    np.testing.assert_allclose(moved.grid_u, made.over(STEP, START, (0,), None, force).grid_u, atol=1e-7)

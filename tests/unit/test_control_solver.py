@@ -31,10 +31,10 @@ def solve(kind: str, system: LagrangianSystem, x0: list[float], time: float = 0.
 def test_unconstrained_linear_problem_has_the_riccati_solution(kind):
     solver, references = problem(oscillator(), kind, reference=REST, weights=Weights(states=2.0, inputs=0.1))
     x0 = np.array([0.7, -0.4])
-    made = references.over(0.0, x0, 0)
+    made = references.over(0.0, x0, (0,))
     found = solver.solve(x0, made)
     P, ocp = solver.ocp.targets(made).P, solver.ocp
-    A, B = ocp.linearise_at(np.zeros(2), np.zeros(1))
+    A, B = ocp.linearise_at(np.zeros(2), np.zeros(1), np.zeros(1))
     K = np.linalg.solve(ocp.R + B.T @ P @ B, B.T @ P @ A)
     x = x0
     for k in range(ocp.horizon):
@@ -88,7 +88,7 @@ def test_plan_obeys_the_model():
 def test_real_time_iterations_converge_to_the_converged_solution():
     x0 = np.array([0.8, 1.0, 0.0])
     rti, references = problem(motor_cart(), "rti", **LIMITS)
-    made = references.over(0.0, x0, 0)
+    made = references.over(0.0, x0, (0,))
     guess = Plan(made.x, made.u)
     for _ in range(8):
         found = rti.solve(x0, made, guess)
@@ -107,8 +107,8 @@ def test_a_start_without_plan_is_iterated_to_convergence_in_real_time_too():
 
 def test_on_the_reference_nothing_is_to_be_done():
     solver, references = problem(motor_cart(), "sqp")
-    x0 = references.over(0.3, np.array([np.pi / 2, 0.0, 0.0]), 0).x[0]
-    made = references.over(0.3, x0, 0)
+    x0 = references.over(0.3, np.array([np.pi / 2, 0.0, 0.0]), (0,)).x[0]
+    made = references.over(0.3, x0, (0,))
     found = solver.solve(x0, made)
     # Holding u* of the middle of an interval is right to second order.
     np.testing.assert_allclose(found.u, made.u, atol=5e-3)
@@ -143,7 +143,7 @@ def test_iteration_limit_is_a_status_with_a_usable_plan(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_measurement_that_is_not_finite_fails_as_a_status(kind):
     solver, references = problem(motor_cart(), kind)
-    made = references.over(0.0, np.array([1.0, 0.0, 0.0]), 0)
+    made = references.over(0.0, np.array([1.0, 0.0, 0.0]), (0,))
     found = solver.solve(np.array([1.0, np.nan, 0.0]), made)
     assert found.status == SolveStatus.FAILED
     assert "not finite" in found.stats.message
@@ -175,7 +175,7 @@ def test_a_reference_beyond_the_models_edge_is_approached_from_standing_still():
 def test_a_plan_beyond_the_models_edge_is_given_up_for_the_reference():
     solver, references = problem(edge(), "rti", reference=REST)
     x0 = np.array([0.1, 0.0])
-    made = references.over(0.0, x0, 0)
+    made = references.over(0.0, x0, (0,))
     lost = Plan(np.full_like(made.x, 5.0), made.u)
     found = solver.solve(x0, made, lost)
     assert found.status == SolveStatus.SOLVED
@@ -200,7 +200,7 @@ def test_a_quadratic_program_without_solution_fails_as_a_status():
     assert isinstance(solver, GaussNewton)
     solver.qp = Never()
     x0 = np.array([1.0, 0.0, 0.0])
-    found = solver.solve(x0, references.over(0.0, x0, 0))
+    found = solver.solve(x0, references.over(0.0, x0, (0,)))
     assert found.status == SolveStatus.FAILED
     assert found.stats.message == "never did not solve the quadratic program"
 
@@ -214,7 +214,7 @@ def test_a_plan_that_is_not_finite_fails_as_a_status():
     assert isinstance(solver, GaussNewton)
     solver.qp = Wild()
     x0 = np.array([1.0, 0.0, 0.0])
-    made = references.over(0.0, x0, 0)
+    made = references.over(0.0, x0, (0,))
     with np.errstate(all="ignore"):
         once = solver._from(x0, Plan(made.x, made.u), solver.ocp.targets(made), cold=False)
         found = solver.solve(x0, made, Plan(made.x, made.u))
@@ -236,7 +236,7 @@ def test_ipopt_that_raises_fails_as_a_status(monkeypatch):
 
     monkeypatch.setattr(solver, "_solver", broken)
     x0 = np.array([1.0, 0.0, 0.0])
-    found = solver.solve(x0, references.over(0.0, x0, 0))
+    found = solver.solve(x0, references.over(0.0, x0, (0,)))
     assert found.status == SolveStatus.FAILED
     assert found.stats.message == "IPOPT: out of order"
 
@@ -251,7 +251,7 @@ def test_substeps_refine_the_prediction():
 def test_guess_and_references_are_left_as_they_were():
     solver, references = problem(motor_cart(), "sqp", reference=CART)
     x0 = np.array([1.0, 0.0, 0.0])
-    made = references.over(0.0, x0, 0)
+    made = references.over(0.0, x0, (0,))
     guess = Plan(made.x.copy(), made.u.copy())
     solver.solve(x0, made, guess)
     np.testing.assert_array_equal(guess.x, made.x)

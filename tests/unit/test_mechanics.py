@@ -188,3 +188,12 @@ def test_accelerations_and_nothing_else_depend_on_the_inputs() -> None:
 def test_unknown_plant_lists_those_there_are() -> None:
     with pytest.raises(Exception, match="dc_motor_cart"):
         plant("dc_motor")
+
+
+def test_a_force_besides_the_inputs_acts_as_an_input_does():
+    system, x = DCWC.system, np.array([0.3, 1.0, -0.5])
+    force, p = np.array([0.2, -3.0]), P
+    pushed = evaluate(system.loaded().derivative, x, np.zeros(2), np.concatenate([p, force]))
+    np.testing.assert_allclose(pushed, evaluate(system.derivative, x, force, p), atol=1e-14)
+    units = [q.unit for q in system.loaded().parameters[-2:]]
+    assert units == ["N.m", "V"]

@@ -123,8 +123,8 @@ def test_a_scenario_without_controller_or_simulation_has_no_metrics(frame: pd.Da
 def test_without_a_named_output_the_measured_coordinate_follows_the_reference() -> None:
     text = scenario_text(control=True).replace("  output: plant.x\n", "")
     direct = text.replace("        through: {map: scotch_yoke, crank: 0.2}\n", "")
-    assert control_loops(scenario(direct))[0].output == "plant.alpha"
-    assert control_loops(scenario(text))[0].output is None
+    assert control_loops(scenario(direct))[0].outputs == {"reference": "plant.alpha"}
+    assert control_loops(scenario(text))[0].outputs == {}
 
 
 def test_several_controllers_are_told_apart_by_name(frame: pd.DataFrame) -> None:
