@@ -5,30 +5,21 @@ An FMU has C inside and no Python: FMI 2.0, Co-Simulation and Model Exchange in 
 
 from __future__ import annotations
 
-import importlib.util
 import io
-import os
-import shlex
-import shutil
-import subprocess
-import sys
-import tempfile
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
 from exlinn_fmi.data.files import write_bytes
-from exlinn_fmi.errors import InputError, RunError
 from exlinn_fmi.export.c_code import fmu_texts
 from exlinn_fmi.export.model import StateSpaceModel, plant_model, system_model
 from exlinn_fmi.export.model_description import SOURCE
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.plant import Plant
+from exlinn_fmi.toolchain import compile_library, find_compiler
 
 # No contraction to fused multiply-add: every platform gives the same trajectory.
-FLAGS = ("-O2", "-std=c99", "-fvisibility=hidden", "-ffp-contract=off", "-shared")
-# Linux alone would otherwise let a library through that lacks a symbol.
-PLATFORM_FLAGS = {"linux": ("-fPIC", "-Wl,-z,defs"), "darwin": ("-fPIC",)}
+FLAGS = ("-O2", "-std=c99", "-fvisibility=hidden", "-ffp-contract=off")
 
 
 def export_plant(plant: Plant, path: Path, *, compiler: str | None = None) -> Path:
@@ -84,67 +75,11 @@ def export_model(model: StateSpaceModel, path: Path, *, compiler: str | None = N
     file = path / f"{model.identifier}.fmu" if path.is_dir() else path
     members = {name: text.encode() for name, text in fmu_texts(model).items()}
     binary = f"{model.identifier}{fmpy.sharedLibraryExtension}"
-    members[f"binaries/{fmpy.platform}/{binary}"] = _compile(members, binary, find_compiler(compiler))
+    sources = {name.removeprefix("sources/"): c for name, c in members.items() if name.startswith("sources/")}
+    command = find_compiler(compiler)
+    members[f"binaries/{fmpy.platform}/{binary}"] = compile_library(sources, SOURCE, binary, FLAGS, command)
     write_bytes(file, _pack(members))
     return file
-
-
-def find_compiler(compiler: str | None = None) -> list[str]:
-    """The C compiler's command line.
-
-    Args:
-        compiler: command asked for, with its arguments; default as said at `export_plant`.
-
-    Raises:
-        InputError: there is none, or not the one asked for.
-    """
-    asked = compiler or os.environ.get("CC")
-    if asked:
-        command = shlex.split(asked, posix=os.name == "posix")
-        if shutil.which(command[0]) is None:
-            source = "compiler" if compiler else "environment variable CC"
-            raise InputError(f"{source}: no command {command[0]!r}; give the name or path of a C compiler")
-        return command
-    for name in ("cc", "gcc", "clang"):
-        if shutil.which(name):
-            return [name]
-    if importlib.util.find_spec("ziglang"):
-        return [sys.executable, "-m", "ziglang", "cc"]
-    raise InputError(
-        "no C compiler found (looked for the environment variable CC, then cc, gcc, clang, then the Python "
-        "package ziglang); install one: `pip install ziglang` works everywhere"
-    )
-
-
-def _compile(members: Mapping[str, bytes], binary: str, compiler: list[str]) -> bytes:
-    """Compile the sources to a shared library that holds no path of this machine, debug information included.
-
-    Raises:
-        RunError: with what the compiler said.
-    """
-    with tempfile.TemporaryDirectory(prefix="exlinn-export-") as folder:
-        for name, content in members.items():
-            if name.startswith("sources/"):
-                (Path(folder) / Path(name).name).write_bytes(content)
-        here = f"-ffile-prefix-map={folder}=."
-        command = [
-            *compiler,
-            *FLAGS,
-            *PLATFORM_FLAGS.get(sys.platform, ()),
-            here,
-            SOURCE,
-            "-o",
-            binary,
-            "-lm",
-        ]
-        result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-        if result.returncode:
-            said = (result.stderr or result.stdout).strip()[:4000]
-            raise RunError(
-                f"the C compiler failed: {shlex.join(command)}\n{said}\n"
-                "choose another C compiler with the environment variable CC"
-            )
-        return (Path(folder) / binary).read_bytes()
 
 
 def _pack(members: Mapping[str, bytes]) -> bytes:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import shutil
 import stat
-import sys
 import zipfile
 from pathlib import Path
 
@@ -15,9 +12,8 @@ import pytest
 from export_helpers import instance
 
 from exlinn_fmi import export
-from exlinn_fmi.errors import InputError, RunError, StorageError
+from exlinn_fmi.errors import RunError, StorageError
 from exlinn_fmi.export import export_plant, export_system
-from exlinn_fmi.export.build import find_compiler
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.learned import ModelSpec, Scales, learned_system
@@ -29,10 +25,6 @@ PENDULUM = LagrangianSystem.build(
     lambda q, v, p: v[0] ** 2 / 2 + 9.81 * ca.cos(q[0]),
     lambda v, p: 0 * v[0],
 )
-
-
-def nothing_found(name: str, *_: object) -> None:
-    return None
 
 
 def test_public_names_are_sorted_and_exist() -> None:
@@ -85,39 +77,6 @@ def test_a_learned_model_runs_as_in_python(tmp_path: Path) -> None:
     u = np.tile([[0.0], [5.0]], 200)
     expected = system.rk4().mapaccum(200)([0.5, 0.0, 0.0], u, [], h).full().T
     np.testing.assert_allclose(states, expected, rtol=0, atol=1e-12)
-
-
-def test_the_environments_compiler_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CC", f"{sys.executable} -m some.compiler")
-    assert find_compiler() == [sys.executable, "-m", "some.compiler"]
-
-
-def test_the_compiler_asked_for_goes_before_the_environments(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CC", "no-such-compiler")
-    assert find_compiler(sys.executable) == [sys.executable]
-
-
-def test_a_compiler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match="compiler: no command 'no-such-cc'"):
-        find_compiler("no-such-cc -O3")
-    monkeypatch.setenv("CC", "no-such-cc")
-    with pytest.raises(InputError, match="environment variable CC: no command 'no-such-cc'"):
-        find_compiler()
-
-
-def test_ziglang_serves_where_there_is_no_system_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("CC", raising=False)
-    monkeypatch.setattr(shutil, "which", nothing_found)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name == "ziglang" or None)
-    assert find_compiler() == [sys.executable, "-m", "ziglang", "cc"]
-
-
-def test_no_compiler_at_all_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("CC", raising=False)
-    monkeypatch.setattr(shutil, "which", nothing_found)
-    monkeypatch.setattr(importlib.util, "find_spec", nothing_found)
-    with pytest.raises(InputError, match=r"no C compiler found.*pip install ziglang"):
-        find_compiler()
 
 
 def test_a_compiler_that_fails_is_quoted_and_nothing_is_written(tmp_path: Path) -> None:
