@@ -7,7 +7,6 @@ has some runs all the same, with their start values.
 
 from __future__ import annotations
 
-import shutil
 import weakref
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
+from exlinn_fmi.components.cache import Lease
 from exlinn_fmi.components.fmu_description import FmuDescription
 from exlinn_fmi.components.fmu_file import check_runnable, read_description, unpack
 from exlinn_fmi.components.fmu_native import (
@@ -49,7 +49,7 @@ def read_variables(path: Path, runnable: bool = False) -> tuple[Variable, ...]:
 
 
 class FmuComponent(Component):
-    """An FMU for Co-Simulation, unpacked to a temporary folder for as long as it is open.
+    """An FMU for Co-Simulation, unpacked into the cache.
 
     Args:
         name: name in the scenario, and of the FMU's instance.
@@ -64,13 +64,13 @@ class FmuComponent(Component):
         self.name = name
         self._description = read_description(Path(path))
         self.variables = self._description.variables
-        folder = unpack(self._description)
+        lease = unpack(self._description)
         try:
-            self._instance = make_instance(self._description, folder, name)
+            self._instance = make_instance(self._description, lease.folder, name)
         except BaseException:
-            shutil.rmtree(folder, ignore_errors=True)
+            lease.release()
             raise
-        self._release = weakref.finalize(self, _release, self._instance, folder)
+        self._release = weakref.finalize(self, _release, self._instance, lease)
         self._phase = "instantiated"
         self._plans: dict[tuple[str, bytes], _Plan] = {}
         self._h = 0.0
@@ -206,7 +206,7 @@ class FmuComponent(Component):
             raise ComponentError(self.name, f"restoring the state failed: {error}") from error
 
     def close(self) -> None:
-        """Terminate and free the instance, unload the binary, remove the folder."""
+        """Terminate and free the instance, unload the binary, give the folder back."""
         self._plans.clear()
         self._release()
 
@@ -315,7 +315,7 @@ def _free_state(instance: Instance, generation: int, state: int) -> None:
         instance.free_state(state)
 
 
-def _release(instance: Instance, folder: Path) -> None:
-    """Close an instance and remove its folder, in this order: Windows keeps loaded files."""
+def _release(instance: Instance, lease: Lease) -> None:
+    """Close an instance and give its folder back, in this order: Windows keeps loaded files."""
     instance.close()
-    shutil.rmtree(folder, ignore_errors=True)
+    lease.release()

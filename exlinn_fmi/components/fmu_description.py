@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -72,12 +74,12 @@ def describe(path: Path, model: Any) -> FmuDescription:
     """
     use = model.coSimulation
     identifier = use.modelIdentifier or ""
-    if not identifier or set(identifier) & set("/\\:\0") or identifier in (".", ".."):
-        raise FmuError(f"{path}: the model identifier {identifier!r} is no file name")
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,199}", identifier):
+        raise FmuError(f"{path}: the model identifier {identifier!r} is no C identifier, as FMI demands")
     scalars = [v for v in model.modelVariables if v.type in _TYPES and not v.dimensions]
     names = [v.name for v in scalars]
     if len(set(names)) < len(names):
-        twice = next(name for k, name in enumerate(names) if name in names[:k])
+        twice = next(name for name, count in Counter(names).items() if count > 1)
         raise FmuError(f"{path}: two variables are called {twice!r}")
     version: Literal[2, 3] = 2 if model.fmiVersion == "2.0" else 3
     enumeration = "Integer" if version == 2 else "Int64"

@@ -6,31 +6,26 @@ identifier are checked here; what the model description says is in `fmu_descript
 
 from __future__ import annotations
 
+import hashlib
 import re
-import shutil
 import struct
-import tempfile
-import zipfile
-import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from xml.etree import ElementTree
 
 import fmpy
 
+from exlinn_fmi.components.archive import extract, open_archive, parse_xml, read_member
+from exlinn_fmi.components.cache import Lease, lease
 from exlinn_fmi.components.fmu_description import FmuDescription, describe
-from exlinn_fmi.errors import FmuError, StorageError, nearest
+from exlinn_fmi.errors import FmuError, StorageError
 
 DESCRIPTION = "modelDescription.xml"
-LARGEST_DESCRIPTION = 256 * 2**20
-"""Bytes of XML that are read at most: a compressed file of 1 MB can unpack to gigabytes."""
+UNUSED = ("sources/", "documentation/", "binaries/")
+"""Folders of an FMU that are not unpacked, but for the binaries of this machine."""
 
-LARGEST_HARMLESS = 2**30
-"""Bytes that an FMU may unpack to however small it is; beyond, a hundredfold growth is an attack."""
-
-_UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
-"""What zipfile raises for damaged, encrypted and unknown contents."""
+LARGEST_EXPLAINED = 2**20
+"""Bytes of XML that are validated to explain what is wrong: the time grows with the square of the size."""
 
 
 def read_description(path: Path) -> FmuDescription:
@@ -39,8 +34,16 @@ def read_description(path: Path) -> FmuDescription:
     Raises:
         FmuError: the file is missing or damaged, or no FMI 2.0 or 3.0 FMU for Co-Simulation.
     """
-    with _archive(path) as archive:
-        root = _xml_root(path, _read_xml(path, archive))
+    stamp = path.stat() if path.is_file() else None
+    return _read_description(path, stamp and (stamp.st_mtime_ns, stamp.st_size))
+
+
+@lru_cache(maxsize=8)
+def _read_description(path: Path, stamp: tuple[int, int] | None) -> FmuDescription:
+    """A large description takes seconds, and is asked for by the checks and again by the run."""
+    with open_archive(path) as archive:
+        data = read_member(path, archive, DESCRIPTION)
+    root = parse_xml(f"{path}: {DESCRIPTION}", data)
     version = root.get("fmiVersion", "")
     if root.tag != "fmiModelDescription" or not version:
         raise FmuError(f"{path}: {DESCRIPTION} begins with <{root.tag}>, expected <fmiModelDescription>")
@@ -58,7 +61,7 @@ def read_description(path: Path) -> FmuDescription:
         raise
     except Exception as error:  # FMPy reads what follows the schema; all else fails somewhere in it
         raise FmuError(
-            f"{path}: {DESCRIPTION} does not follow FMI {version}: {_schema_problems(path, error)}"
+            f"{path}: {DESCRIPTION} does not follow FMI {version}: {_schema_problems(path, len(data), error)}"
         ) from error
 
 
@@ -68,124 +71,49 @@ def check_runnable(description: FmuDescription) -> None:
     Raises:
         FmuError: says which platforms it has binaries for, and what to do.
     """
-    with _archive(description.path) as archive:
+    with open_archive(description.path) as archive:
         _check_binary(description, archive.namelist())
 
 
-def unpack(description: FmuDescription) -> Path:
-    """Unpack an FMU into a new temporary folder, less sources, documentation and other platforms' binaries.
+def unpack(description: FmuDescription) -> Lease:
+    """Unpack an FMU into the cache, less sources, documentation and other platforms' binaries.
 
     Returns:
-        The folder, which is the caller's to remove.
+        The folder, in use until it is released. An FMU that may be instantiated once per process gets another
+        folder each time, so that its binary is loaded anew.
 
     Raises:
-        FmuError: it has no binary for this platform, or is damaged.
+        FmuError: it has no binary for this platform, is damaged or means harm.
         StorageError: it does not fit on the disk.
     """
     check_runnable(description)
-    path = description.path
-    own = f"binaries/{description.platform}/"
-    with _archive(path) as archive:
-        wanted = [
-            info
-            for info in archive.infolist()
-            if not info.filename.startswith(("sources/", "documentation/", "binaries/"))
-            or info.filename.startswith(own)
-        ]
-        folder = Path(tempfile.mkdtemp(prefix="exlinn-fmu-"))
-        try:
-            size, free = sum(info.file_size for info in wanted), shutil.disk_usage(folder).free
-            if size > LARGEST_HARMLESS and size > 100 * path.stat().st_size:
-                raise FmuError(
-                    f"{path}: {path.stat().st_size / 1e6:.1f} MB that unpack to {size / 1e6:.0f} MB: "
-                    "this is a zip bomb or a mistake; it is not unpacked"
-                )
-            if size > free:
-                raise StorageError(
-                    f"{path}: unpacked it takes {size / 1e6:.0f} MB, but {folder.parent} has only "
-                    f"{free / 1e6:.0f} MB free"
-                )
-            archive.extractall(folder, wanted)
-            _check_whole(description, folder)
-        except BaseException as error:
-            shutil.rmtree(folder, ignore_errors=True)
-            if isinstance(error, OSError):
-                raise StorageError(f"{path}: cannot be unpacked to {folder.parent}: {error}") from error
-            raise
-    return folder
+    path, own = description.path, f"binaries/{description.platform}/"
 
+    def fill(folder: Path) -> None:
+        with open_archive(path) as archive:
+            extract(path, archive, folder, lambda name: not name.startswith(UNUSED) or name.startswith(own))
+        _check_whole(description, folder)
 
-# ── the archive ──────────────────────────────────────────────────────────────────────────────────────────
-
-
-@contextmanager
-def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
-    """The FMU as a zip archive whose names have been checked.
-
-    Raises:
-        FmuError: it cannot be read, also where that shows only while it is used.
-    """
-    if not path.is_file():
-        what = "is a folder, expected an .fmu file" if path.is_dir() else "no such file"
-        beside = [p.name for p in path.parent.glob("*.fmu")] if path.parent.is_dir() else []
-        raise FmuError(f"{path}: {what}; {nearest(path.name, beside, 'FMUs there')}")
     try:
-        with zipfile.ZipFile(path) as archive:
-            _check_names(path, archive.namelist())
-            yield archive
-    except _UNREADABLE as error:
         with path.open("rb") as file:
-            is_zip = file.read(2) == b"PK"
-        what = "the zip archive is damaged or cut short" if is_zip else "not a zip archive, as every FMU is"
-        size = path.stat().st_size
-        raise FmuError(f"{path}: {what} ({size} bytes; {error}); copy or export it again") from error
+            content = hashlib.file_digest(file, "sha256").hexdigest()
+        return lease(f"{content[:32]}-{description.platform}", fill, alone=description.once)
     except OSError as error:
-        raise FmuError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise StorageError(f"{path}: cannot be unpacked: {error}") from error
 
 
-def _check_names(path: Path, names: Sequence[str]) -> None:
-    """Refuse archives whose members would land outside the folder or on one another."""
-    seen: set[str] = set()
-    for name in names:
-        parts = PurePosixPath(name)
-        if parts.is_absolute() or ".." in parts.parts or "\\" in name or ":" in name:
-            raise FmuError(f"{path}: the archive holds {name!r}, which would be written outside its folder")
-        if str(parts) in seen:
-            raise FmuError(f"{path}: the archive holds {name!r} twice; export it again")
-        seen.add(str(parts))
+# ── checks ───────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _read_xml(path: Path, archive: zipfile.ZipFile) -> bytes:
-    """The bytes of the model description."""
-    names = archive.namelist()
-    if DESCRIPTION not in names:
-        deeper = next((n for n in names if n.endswith(f"/{DESCRIPTION}")), None)
-        hint = f"it lies in {deeper!r}: zip the folder's contents, not the folder" if deeper else "no FMU"
-        raise FmuError(f"{path}: no {DESCRIPTION} at the top of the archive; {hint}")
-    size = archive.getinfo(DESCRIPTION).file_size
-    if size > LARGEST_DESCRIPTION:
-        raise FmuError(
-            f"{path}: {DESCRIPTION} is {size / 2**20:.0f} MiB, expected at most "
-            f"{LARGEST_DESCRIPTION / 2**20:.0f} MiB"
-        )
-    return archive.read(DESCRIPTION)
-
-
-def _xml_root(path: Path, data: bytes) -> ElementTree.Element:
-    try:
-        return ElementTree.fromstring(data)
-    except (ElementTree.ParseError, LookupError, ValueError) as error:  # also encodings that are unknown
-        raise FmuError(f"{path}: {DESCRIPTION} is no well-formed XML: {error}") from error
-
-
-def _schema_problems(path: Path, error: Exception) -> str:
+def _schema_problems(path: Path, size: int, error: Exception) -> str:
     """The first problems that the FMI schema finds, or else FMPy's own error."""
-    try:
-        fmpy.read_model_description(str(path), validate=True)
-    except fmpy.model_description.ValidationError as invalid:
-        return "; ".join(str(problem) for problem in invalid.problems[:3])
-    except Exception as other:
-        return f"{type(other).__name__}: {other}"
+    if size <= LARGEST_EXPLAINED:
+        try:
+            fmpy.read_model_description(str(path), validate=True)
+        except fmpy.model_description.ValidationError as invalid:
+            return "; ".join(str(problem) for problem in invalid.problems[:3])
+        except Exception as other:
+            return f"{type(other).__name__}: {other}"
     return f"{type(error).__name__}: {error}"
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import math
-import tempfile
 import weakref
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from fmu_helpers import TYPES_3, Driver, description_2, probe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from exlinn_fmi.components import cache
 from exlinn_fmi.components.base import Status
 from exlinn_fmi.components.fmu import FmuComponent, read_variables
 from exlinn_fmi.errors import ComponentError, FmuError, InputError
@@ -451,40 +451,39 @@ def test_a_state_that_cannot_be_restored_is_a_component_error(tmp_path: Path) ->
 
 
 @pytest.fixture
-def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder that FMUs are unpacked into."""
-    folder = tmp_path / "temporary"
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    return folder
+def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Names of the folders in a cache of this test alone, and whether nobody uses any of them."""
+    monkeypatch.setenv("EXLINN_CACHE", str(tmp_path / "cache"))
+
+    def look() -> tuple[int, bool]:
+        found = list((tmp_path / "cache").iterdir())
+        return len(found), all(cache._evict(folder) for folder in found)
+
+    return look
 
 
-def test_closing_removes_the_folder_and_may_be_done_twice(tmp_path: Path, temporary: Path) -> None:
+def test_closing_gives_the_folder_back_and_may_be_done_twice(tmp_path: Path, folders) -> None:
     component = FmuComponent("probe", probe(tmp_path))
-    assert list(temporary.iterdir())
+    assert folders() == (1, False)
     component.close()
     component.close()
-    assert not list(temporary.iterdir())
+    assert folders() == (1, True)
 
 
-def test_a_component_that_is_dropped_frees_its_instance_and_folder(
-    tmp_path: Path, temporary: Path, trace
-) -> None:
+def test_a_component_that_is_dropped_frees_its_instance_and_folder(tmp_path: Path, folders, trace) -> None:
     driver = Driver(FmuComponent("probe", probe(tmp_path))).begin()
     dropped = weakref.ref(driver.component)
     del driver
     assert dropped() is None
     assert trace()[-2:] == ["Terminate", "FreeInstance"]
-    assert not list(temporary.iterdir())
+    assert folders() == (1, True)
 
 
 @pytest.mark.parametrize("define", ["REFUSE", "LACKING"])
-def test_a_component_that_cannot_be_made_leaves_no_folder(
-    tmp_path: Path, temporary: Path, define: str
-) -> None:
+def test_a_component_that_cannot_be_made_gives_its_folder_back(tmp_path: Path, folders, define: str) -> None:
     with pytest.raises(FmuError):
         FmuComponent("probe", probe(tmp_path, define))
-    assert not list(temporary.iterdir())
+    assert folders() == (1, True)
 
 
 def test_a_closed_component_cannot_crash_the_process(probe2: Driver) -> None:

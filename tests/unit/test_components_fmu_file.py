@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import platform
 import stat
-import tempfile
+import subprocess
 import warnings
 import zipfile
 from pathlib import Path
@@ -14,7 +14,7 @@ import fmpy
 import pytest
 from fmu_helpers import VARIABLES_2, description_2, library, pack, probe
 
-from exlinn_fmi.components import fmu_file
+from exlinn_fmi.components import archive
 from exlinn_fmi.components.fmu import FmuComponent, read_variables
 from exlinn_fmi.components.fmu_file import read_description, unpack
 from exlinn_fmi.errors import FmuError, StorageError
@@ -107,8 +107,8 @@ def test_a_zipped_folder_is_told(tmp_path: Path) -> None:
         (description_2(version="1.0"), r"FMI version 1\.0; expected 2\.0 or 3\.0"),
         (description_2(use="ModelExchange"), "no Co-Simulation: it is for ModelExchange only"),
         ('<fmiModelDescription fmiVersion="2.0"/>', "no Co-Simulation: it names no kind of use"),
-        (description_2(identifier="../../Probe"), "the model identifier '../../Probe' is no file name"),
-        (description_2(identifier=""), "the model identifier '' is no file name"),
+        (description_2(identifier="../../Probe"), "the model identifier '../../Probe' is no C identifier"),
+        (description_2(identifier=""), "the model identifier '' is no C identifier"),
         (description_2(variables=VARIABLES_2 * 2), "two variables are called 'u'"),
         (
             description_2(variables=VARIABLES_2.replace('start="2" min', 'start="two" min')),
@@ -144,7 +144,7 @@ def test_a_problem_that_no_schema_knows_is_told_in_fmpys_words(
 
 
 def test_a_huge_model_description_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fmu_file, "LARGEST_DESCRIPTION", 1000)
+    monkeypatch.setattr(archive, "LARGEST_XML", 1000)
     with pytest.raises(FmuError, match="expected at most"):
         read_variables(with_description(tmp_path, description_2()))
 
@@ -171,18 +171,17 @@ def test_a_member_that_is_there_twice_is_refused(tmp_path: Path) -> None:
 def test_an_archive_that_does_not_fit_is_not_unpacked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "temporary").mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    monkeypatch.setenv("EXLINN_CACHE", str(tmp_path / "cache"))
     path = probe(tmp_path)
     usage = type("Usage", (), {"free": 10})
-    monkeypatch.setattr(fmu_file.shutil, "disk_usage", lambda _: usage)
+    monkeypatch.setattr(archive.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(StorageError, match="MB free"):
         FmuComponent("probe", path)
-    assert not list((tmp_path / "temporary").iterdir())
+    assert not list((tmp_path / "cache").iterdir())
 
 
 def test_a_zip_bomb_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fmu_file, "LARGEST_HARMLESS", 2**20)
+    monkeypatch.setattr(archive, "LARGEST_HARMLESS", 2**20)
     members = {
         "modelDescription.xml": description_2(),
         BINARY: library("probe2.c"),
@@ -195,15 +194,15 @@ def test_a_zip_bomb_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_a_disk_that_fills_while_unpacking_is_told(
     tmp_path: Path, tiny_disk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tiny_disk))
-    monkeypatch.setattr(fmu_file.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 1e12}))
+    monkeypatch.setenv("EXLINN_CACHE", str(tiny_disk))
+    monkeypatch.setattr(archive.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 1e12}))
     members = {
         "modelDescription.xml": description_2(),
         BINARY: library("probe2.c"),
         "resources/x": bytes(10**6),
     }
     path = pack(tmp_path / "Probe.fmu", members)
-    with pytest.raises(StorageError, match=r"Probe\.fmu: cannot be unpacked to .*No space left"):
+    with pytest.raises(StorageError, match=r"Probe\.fmu: cannot be unpacked: .*No space left"):
         FmuComponent("probe", path)
     assert not list(tiny_disk.iterdir())
 
@@ -275,14 +274,134 @@ def test_only_what_this_machine_needs_is_unpacked(tmp_path: Path) -> None:
         "documentation/index.html": "<html/>",
         "resources/table.txt": "1 2 3",
     }
-    folder = unpack(read_description(pack(tmp_path / "Probe.fmu", members)))
-    files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    lease = unpack(read_description(pack(tmp_path / "Probe.fmu", members)))
+    files = {str(p.relative_to(lease.folder)) for p in lease.folder.rglob("*") if p.is_file()}
     assert files == {"modelDescription.xml", BINARY, "resources/table.txt"}
-    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    fmu_file.shutil.rmtree(folder)
+    assert stat.S_IMODE(lease.folder.stat().st_mode) == 0o700
+    lease.release()
 
 
 def test_the_platform_is_named_as_the_fmi_version_has_it(tmp_path: Path) -> None:
     assert read_description(probe(tmp_path)).platform == fmpy.platform
     three = read_description(probe(tmp_path, version=3)).platform
     assert three.startswith(platform.machine().lower().replace("amd64", "x86_64"))
+
+
+# ── more that means harm ─────────────────────────────────────────────────────────────────────────────────
+
+
+BOMB = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]>'
+READER = '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
+
+
+@pytest.mark.parametrize("doctype", [BOMB, READER, "<!DOCTYPE fmiModelDescription SYSTEM 'http://x/y.dtd'>"])
+@pytest.mark.parametrize("encoding", ["UTF-8", "UTF-16"])
+def test_a_document_type_is_refused_before_an_entity_can_grow(
+    tmp_path: Path, doctype: str, encoding: str
+) -> None:
+    text = description_2().replace("?>", f"?>{doctype}", 1).replace("UTF-8", encoding)
+    path = pack(tmp_path / "Probe.fmu", {"modelDescription.xml": text.encode(encoding)})
+    with pytest.raises(FmuError, match="defines a document type"):
+        read_variables(path)
+
+
+def test_elements_nested_a_million_deep_are_told(tmp_path: Path) -> None:
+    deep = "<a>" * 10**6 + "</a>" * 10**6
+    text = description_2().replace("<ModelVariables>", f"<ModelVariables>{deep}")
+    with pytest.raises(FmuError, match=r"modelDescription\.xml"):
+        read_variables(with_description(tmp_path, text))
+
+
+@pytest.mark.parametrize("mode", [stat.S_IFLNK, stat.S_IFIFO, stat.S_IFCHR])
+def test_links_and_devices_are_refused(tmp_path: Path, mode: int) -> None:
+    path = probe(tmp_path)
+    info = zipfile.ZipInfo("resources/table.txt")
+    info.external_attr = (mode | 0o777) << 16
+    with zipfile.ZipFile(path, "a") as file:
+        file.writestr(info, "/etc/passwd")
+    with pytest.raises(FmuError, match=r"'resources/table\.txt' in it is (a link|no file); put the file"):
+        FmuComponent("probe", path)
+
+
+@pytest.mark.parametrize("name", ["resources/a\x00b", "resources/a\nb", "resources/\x1b[2J"])
+def test_names_that_are_no_file_names_are_refused(tmp_path: Path, name: str) -> None:
+    path = probe(tmp_path)
+    stand_in = "resources/" + "z" * (len(name) - 10)
+    with zipfile.ZipFile(path, "a") as file:
+        file.writestr(stand_in, "x")
+    path.write_bytes(path.read_bytes().replace(stand_in.encode(), name.encode()))
+    if "\x00" in name:  # which zipfile takes for the end of the name
+        assert read_variables(path)
+        return
+    with pytest.raises(FmuError, match="which is no file name"):
+        read_variables(path)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "word"),
+    [
+        ("resources/a", "resources/./a", "twice"),
+        ("resources/a", "resources//a", "twice"),
+        ("resources/a/b", "resources/a", "twice"),
+        ("resources/a", "resources/a/b", "as a file and as a folder"),
+    ],
+)
+def test_members_that_would_land_on_one_another_are_refused(
+    tmp_path: Path, first: str, second: str, word: str
+) -> None:
+    path = probe(tmp_path)
+    with zipfile.ZipFile(path, "a") as file:
+        file.writestr(first, "x")
+        file.writestr(second, "y")
+    with pytest.raises(FmuError, match=word):
+        read_variables(path)
+
+
+def test_an_archive_of_very_many_members_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(archive, "MOST_MEMBERS", 100)
+    members = dict.fromkeys((f"resources/{k}" for k in range(100)), "")
+    path = pack(tmp_path / "Probe.fmu", {"modelDescription.xml": description_2(), **members})
+    with pytest.raises(FmuError, match="has 101 members, expected at most 100"):
+        read_variables(path)
+
+
+def test_a_member_that_is_larger_than_it_says_is_not_unpacked(tmp_path: Path) -> None:
+    path = probe(tmp_path)
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("resources/x", bytes(10**6))
+    said = (10**6).to_bytes(4, "little")
+    path.write_bytes(path.read_bytes().replace(said, (10).to_bytes(4, "little")))
+    with pytest.raises(FmuError, match="damaged or cut short"):
+        FmuComponent("probe", path)
+
+
+@pytest.mark.parametrize("identifier", ["a/b", "..", "a b", "Probe\n", "a" * 201, "Prøbe", "1st"])
+def test_a_model_identifier_that_is_no_c_identifier_is_refused(tmp_path: Path, identifier: str) -> None:
+    with pytest.raises(FmuError, match="is no C identifier"):
+        read_variables(
+            with_description(tmp_path, description_2(identifier=identifier.replace("\n", "&#10;")))
+        )
+
+
+def test_an_fmu_for_windows_starts_no_other_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a program was started")
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    members = {"modelDescription.xml": description_2(), "binaries/win64/Probe.dll": "MZ"}
+    with pytest.raises(FmuError, match="no binary for"):
+        FmuComponent("probe", pack(tmp_path / "Probe.fmu", members))
+
+
+def test_a_description_of_many_variables_is_read_and_a_mistake_at_its_end_told(tmp_path: Path) -> None:
+    one = '<ScalarVariable name="v{0}" valueReference="{0}"><Real/></ScalarVariable>'
+    many = "".join(one.format(k) for k in range(20_000))
+    assert len(read_variables(with_description(tmp_path, description_2(variables=many)))) == 20_000
+    twice = many + one.format(19_999)
+    with pytest.raises(FmuError, match="two variables are called 'v19999'"):
+        read_variables(with_description(tmp_path, description_2(variables=twice)))
+    wrong = many + '<ScalarVariable name="w"><Real/></ScalarVariable>'
+    with pytest.raises(
+        FmuError, match=r"does not follow FMI 2\.0: TypeError"
+    ):  # validation would take minutes
+        read_variables(with_description(tmp_path, description_2(variables=wrong)))
