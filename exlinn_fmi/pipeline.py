@@ -48,20 +48,19 @@ def collect(work: Run) -> Dataset:
     """
     from exlinn_fmi.data.dataset import load_dataset, save_dataset
     from exlinn_fmi.data.measured import import_measured
-    from exlinn_fmi.scenario.learning import LearnFromData
+    from exlinn_fmi.scenario.learning import STRUCTURE, LearnFromData
 
     learn = work.learn
     coordinates = tuple(c.coordinate() for c in learn.coordinates)
+    measured = [c.model_dump(mode="json", exclude=STRUCTURE) for c in learn.coordinates]
     if isinstance(learn, LearnFromData):
         detail = f"{len(learn.data.files) + len(learn.data.test)} measured files"
-        key = fingerprint(learn.data, learn.coordinates, work.seed, files=work.files(learn.data))
+        key = fingerprint(learn.data, measured, work.seed, files=work.files(learn.data))
     else:
         experiments = [*learn.training, *learn.test]
         spec = work.scenario.components[learn.plant]
         detail = f"{len(experiments)} experiments on {learn.plant}"
-        key = fingerprint(
-            spec, learn.plant, learn.coordinates, experiments, files=work.files(spec, experiments)
-        )
+        key = fingerprint(spec, learn.plant, measured, experiments, files=work.files(spec, experiments))
     if work.unchanged("collect", key, detail):
         dataset = load_dataset(work.folder)
         for note in dataset.notes:
@@ -103,7 +102,7 @@ def train(work: Run) -> None:
 
     began, tests = time.perf_counter(), dataset.tests
     part, validation = split(dataset.training, learn.train_fraction, learn.split_blocks, seed)
-    model = fit(part, validation, learn.method, seed, show, work.stop, learn.objective)
+    model = fit(part, validation, learn.method, seed, show, work.stop, learn.objective, learn.structure)
     written = save_model(work.folder, model)
     card = report_card(model, part, tests, learn.identify, truth(work), learn.objective)
     written += write_table(work.folder / "evaluation", card.evaluation, card.units)

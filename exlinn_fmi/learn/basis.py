@@ -9,6 +9,7 @@ quadratic friction for each velocity. Terms that the equations of motion cannot 
 
 from __future__ import annotations
 
+import re
 from itertools import combinations, combinations_with_replacement
 
 import numpy as np
@@ -19,7 +20,8 @@ from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
 from exlinn_fmi.mechanics.learned import angular
-from exlinn_fmi.mechanics.monomials import Factor, MonomialBasis, parse_monomial
+from exlinn_fmi.mechanics.monomials import Factor, MonomialBasis, parse_term
+from exlinn_fmi.mechanics.structure import UNKNOWN, Friction, Structure
 
 Array = NDArray[np.float64]
 
@@ -38,6 +40,8 @@ MARGIN = 1.1
 """A line is covered a little beyond the data."""
 PRODUCTS = 3
 """Highest total order of products of functions of several coordinates."""
+FRICTION: tuple[Friction, ...] = ("viscous", "coulomb", "quadratic")
+"""Friction where none is named."""
 COULOMB = 0.1
 """Coulomb friction changes its sign within this share of the rms velocity."""
 DEPENDENT = 1e-9
@@ -46,31 +50,61 @@ PROBES = 40
 """Random points for each term that tell whether it is new."""
 
 
-def generic_basis(data: Dataset) -> MonomialBasis:
-    """The family for the coordinates of a data set, which gives ranges and velocities."""
+def generic_basis(data: Dataset, structure: Structure = UNKNOWN) -> MonomialBasis:
+    """The family for the coordinates of a data set, which gives ranges and velocities.
+
+    Args:
+        data: what it is to explain.
+        structure: what is known of the plant: terms that it cannot have are left out.
+    """
     samples, coordinates = data.arrays, data.coordinates
-    functions = position_functions(coordinates, samples.q)
-    velocity = [c.velocity for c in coordinates]
-    lagrangian = []
-    for function, _ in functions:
-        prefix = f"{function}*" if function else ""
-        for i, j in combinations_with_replacement(range(len(coordinates)), 2):
-            if coordinates[i].kind == coordinates[j].kind:
-                same = f"0.5*{prefix}{velocity[i]}^2"
-                lagrangian.append(same if i == j else f"{prefix}{velocity[i]}*{velocity[j]}")
-        if function:
-            lagrangian += [f"{prefix}{name}" for name in velocity]
-            lagrangian.append(f"-1*{function}")
-        else:
-            positions = [c.name for c in coordinates if c.topology != "cyclic"]
-            lagrangian += [
-                f"{q}*{c.velocity}" for q in positions for c in reversed(coordinates) if c.name != q
-            ]
-    dissipation = [f"0.5*{name}^2" for name in velocity]
-    for name, rms in zip(velocity, np.sqrt(np.mean(samples.v**2, axis=0)), strict=True):
-        width = COULOMB * rms
-        dissipation += [f"{width:.6g}*logcosh({1 / width:.6g}*{name})", f"{1 / 3:.12g}*abs({name})^3"]
+    lagrangian = [
+        term
+        for function, _ in position_functions(coordinates, samples.q)
+        for term in _terms_with(function, coordinates, structure)
+    ]
+    lagrangian += [c.name for i, c in enumerate(coordinates) if structure.has_offset(i)]
+    dissipation = []
+    for i, rms in enumerate(np.sqrt(np.mean(samples.v**2, axis=0)).tolist()):
+        kinds = structure.friction_of(i, FRICTION)
+        dissipation += [_friction(kind, coordinates[i].velocity, rms) for kind in kinds]
+    dissipation.sort(key=lambda text: text not in [f"0.5*{c.velocity}^2" for c in coordinates])
     return _independent(MonomialBasis(coordinates, tuple(lagrangian), tuple(dissipation)), data)
+
+
+def _terms_with(function: str, coordinates: tuple[Coordinate, ...], structure: Structure) -> list[str]:
+    """Terms of 𝓛 with a function of position, the empty text being the constant."""
+    seen = [i for i, c in enumerate(coordinates) if re.search(rf"\b{re.escape(c.name)}\b", function)]
+    prefix, terms = f"{function}*" if function else "", []
+    for i, j in combinations_with_replacement(range(len(coordinates)), 2):
+        one, other = coordinates[i], coordinates[j]
+        if one.kind == other.kind and structure.allows("M", coordinates, i, seen):
+            same = f"0.5*{prefix}{one.velocity}^2"
+            terms.append(same if i == j else f"{prefix}{one.velocity}*{other.velocity}")
+    if function:
+        terms += [
+            f"{prefix}{c.velocity}"
+            for i, c in enumerate(coordinates)
+            if structure.allows("A", coordinates, i, seen)
+        ]
+        return terms + [f"-1*{function}"] * structure.allows("V", coordinates, 0, seen)
+    return terms + [
+        f"{q.name}*{coordinates[i].velocity}"
+        for j, q in enumerate(coordinates)
+        for i in reversed(range(len(coordinates)))
+        if q.topology != "cyclic" and i != j and structure.allows("K", coordinates, i, [j])
+    ]
+
+
+def _friction(kind: Friction, velocity: str, rms: float) -> str:
+    """A term of D; Coulomb's changes its sign, and Stribeck's peaks, at a share of the rms velocity."""
+    width = COULOMB * rms
+    return {
+        "viscous": f"0.5*{velocity}^2",
+        "coulomb": f"{width:.6g}*logcosh({1 / width:.6g}*{velocity})",
+        "stribeck": f"{width:.6g}*stribeck({1 / width:.6g}*{velocity})",
+        "quadratic": f"{1 / 3:.12g}*abs({velocity})^3",
+    }[kind]
 
 
 def position_functions(coordinates: tuple[Coordinate, ...], q: Float[Array, "N n"]) -> list[tuple[str, int]]:
@@ -138,14 +172,17 @@ def _independent(basis: MonomialBasis, data: Dataset) -> MonomialBasis:
 def entry(text: str, coordinates: tuple[Coordinate, ...]) -> tuple[str, str, float]:
     """Where a term stands in 𝓛, its function of position there, and the factor of its coefficient.
 
-    M_ij [α̇ twice], A_i [linear], V; so that ``0.5*sin(alpha)^2*alpha_dot^2`` is ("M_11", "sin(alpha)^2", 1).
+    M_ij [α̇ twice], A_i [linear], V, F_i [a constant force]; so that ``0.5*sin(alpha)^2*alpha_dot^2`` is
+    ("M_11", "sin(alpha)^2", 1).
 
     Args:
         text: a monomial.
         coordinates: the generalised coordinates, numbered from 1.
     """
     velocities = [c.velocity for c in coordinates]
-    monomial = parse_monomial(text, [c.name for c in coordinates] + velocities)
+    monomial = parse_term(text, coordinates)
+    if text in (pushed := [c.name if c.topology != "line" else "" for c in coordinates]):
+        return f"F_{pushed.index(text) + 1}", "", 1.0
     moved = [f for f in monomial.factors if f.name in velocities and not f.function]
     numbers = [velocities.index(f.name) + 1 for f in moved for _ in range(f.power)]
     others = [f for f in monomial.factors if f not in moved]

@@ -22,7 +22,7 @@ from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.trajectory import Fit, Information, Segments, Shooting, cut, maximum_likelihood
 from exlinn_fmi.learn.weak import inverse_regression, weak_regression
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
-from exlinn_fmi.mechanics.monomials import MonomialBasis, parse_monomial
+from exlinn_fmi.mechanics.monomials import MonomialBasis, parse_term
 
 Array = NDArray[np.float64]
 
@@ -118,10 +118,9 @@ def start(basis: MonomialBasis, data: Dataset, segments: Segments) -> Float[Arra
 def _order(text: str, basis: MonomialBasis) -> int:
     """How elaborate a term is: powers of functions of position; friction beyond viscous counts as 1."""
     velocities = [c.velocity for c in basis.coordinates]
-    names = [c.name for c in basis.coordinates] + velocities
     return sum(
         1 if f.name in velocities else f.power * int(f.function[1:] if f.function[0] == "T" else 1)
-        for f in parse_monomial(text, names).factors
+        for f in parse_term(text, basis.coordinates).factors
         if f.function
     )
 

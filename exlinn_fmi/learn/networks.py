@@ -16,7 +16,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from exlinn_fmi.learn.assembly import Assembly
-from exlinn_fmi.mechanics.learned import NARROWEST, Layout, ModelSpec, friction_width
+from exlinn_fmi.mechanics.layout import Layout
+from exlinn_fmi.mechanics.learned import NARROWEST, ModelSpec, friction_width
 
 Array = NDArray[np.float64]
 
@@ -29,7 +30,7 @@ class _Forward:
     slopes: Float[Array, "B H nz"]
     outputs: Float[Array, "B O"]
     gradients: Float[Array, "B O nz"]
-    slip: Float[Array, "B n k"]
+    slip: tuple[Float[Array, "B n k"], Float[Array, "B n k"]]
     residual: Float[Array, "B n"]
 
 
@@ -86,11 +87,23 @@ class StructuredNetworks:
         residual = np.einsum("bnt,bt->bn", data.value, f) - data.target
         residual += np.einsum("bntz,btz->bn", data.gradient, df)
         residual += coupling_columns(self.spec.layout, data.velocity) @ weights["lagrangian.coupling"]
-        residual += weights["dissipation.viscous"] ** 2 * data.velocity
+        residual += weights["dissipation.viscous"] ** 2 * data.velocity - weights["lagrangian.offset"]
         a, s = weights["dissipation.friction"], friction_width(weights)
-        slip = np.tanh(data.velocity[:, :, None] / s)
-        residual += np.einsum("nk,bnk->bn", a**2 * s, slip)
+        slip = self._slip(data.velocity[:, :, None] / s)
+        residual += np.einsum("nk,bnk->bn", a**2 * s, slip[0])
+        if self.spec.layout.drag:
+            residual += weights["dissipation.quadratic"] ** 2 * data.velocity * np.abs(data.velocity)
         return _Forward(basis, slopes, outputs, gradients, slip, residual)
+
+    def _slip(self, x: Float[Array, "B n k"]) -> tuple[Float[Array, "B n k"], Float[Array, "B n k"]]:
+        """Force of each friction unit at q̇/s, and its derivative: tanh x, and x exp(−x²/2) for Stribeck's."""
+        force = np.tanh(x)
+        slope = 1 - force**2
+        if self.spec.layout.bumps:
+            at = x[:, :, -1]
+            fall = np.exp(-(at**2) / 2)
+            force[:, :, -1], slope[:, :, -1] = at * fall, (1 - at**2) * fall
+        return force, slope
 
     def _basis(
         self, weights: dict[str, Array], data: Assembly
@@ -138,6 +151,7 @@ class StructuredNetworks:
             "lagrangian.output": value.T @ forward.basis
             + np.tensordot(slope, forward.slopes, axes=((0, 2), (0, 2))),
             "lagrangian.coupling": np.array([power[i, j] - power[j, i] for i, j in layout.couplings]),
+            "lagrangian.offset": -pull.sum(axis=0),
             "dissipation.viscous": 2 * weights["dissipation.viscous"] * np.diag(power),
             **self._pull_hidden(weights, forward, data, value, slope),
             **_pull_friction(weights, forward, data, pull),
@@ -200,7 +214,12 @@ class StructuredNetworks:
             output += gradient[..., j, None] * forward.slopes[:, None, None, :, j]
         parts = [*self._hidden_columns(weights, forward, data, value, gradient)]
         parts.append(output.reshape(rows, n, count * layout.basis))
-        parts += [coupling_columns(layout, data.velocity), *_dissipation_columns(weights, data)]
+        own = np.broadcast_to(np.eye(n), (rows, n, n))
+        parts += [
+            coupling_columns(layout, data.velocity),
+            -own,
+            *_dissipation_columns(weights, forward, data),
+        ]
         return forward.residual, np.concatenate(parts, axis=2)[:, :, self._free]
 
     def _output_coefficients(
@@ -265,28 +284,33 @@ def _outputs(
 def _pull_friction(
     weights: dict[str, Array], forward: _Forward, data: Assembly, pull: Float[Array, "B n"]
 ) -> dict[str, Array]:
-    """Derivatives by D's friction and width weights, from those by the residual."""
+    """Derivatives by D's friction, width and drag weights, from those by the residual."""
     a, s = weights["dissipation.friction"], friction_width(weights)
-    slip = np.einsum("bn,bnk->nk", pull, forward.slip)
-    bend = np.einsum("bn,bnk->nk", pull * data.velocity, 1 - forward.slip**2) / s
+    force, slope = (
+        np.einsum("bn,bnk->nk", p, x) for p, x in zip((pull, pull * data.velocity), forward.slip, strict=True)
+    )
+    drag = np.einsum("bn,bn->n", pull, data.velocity * np.abs(data.velocity))
     return {
-        "dissipation.friction": 2 * a * s * slip,
-        "dissipation.width": a**2 * (slip - bend) * (s - NARROWEST),
+        "dissipation.friction": 2 * a * s * force,
+        "dissipation.width": a**2 * (force - slope / s) * (s - NARROWEST),
+        "dissipation.quadratic": 2 * weights["dissipation.quadratic"] * drag,
     }
 
 
-def _dissipation_columns(weights: dict[str, Array], data: Assembly) -> list[Array]:
-    """Columns of D's viscous, friction and width weights."""
+def _dissipation_columns(weights: dict[str, Array], forward: _Forward, data: Assembly) -> list[Array]:
+    """Columns of D's viscous, friction, width and drag weights."""
     v, (rows, n) = data.velocity, data.velocity.shape
     a, s = weights["dissipation.friction"], friction_width(weights)
-    tanh = np.tanh(v[:, :, None] / s)  # (B, n, k)
+    force, slope = forward.slip  # (B, n, k)
     viscous = 2 * weights["dissipation.viscous"] * v
-    friction = 2 * a * s * tanh
-    width = a**2 * (tanh - v[:, :, None] / s * (1 - tanh**2)) * (s - NARROWEST)
+    friction = 2 * a * s * force
+    width = a**2 * (force - v[:, :, None] / s * slope) * (s - NARROWEST)
+    drag = 2 * weights["dissipation.quadratic"] * v * np.abs(v)
     # A velocity's friction acts in its own equation alone.
     own = np.eye(n)
     return [
         viscous[:, :, None] * own,
         (friction[:, :, None] * own[:, :, None]).reshape(rows, n, -1),
         (width[:, :, None] * own[:, :, None]).reshape(rows, n, -1),
+        drag[:, :, None] * own,
     ]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from exlinn_fmi.learn.assembly import Assembly, product_basis
 from exlinn_fmi.learn.factor import fit_factor
 from exlinn_fmi.learn.networks import coupling_columns
-from exlinn_fmi.mechanics.learned import Layout
+from exlinn_fmi.mechanics.layout import Layout
 
 Array = NDArray[np.float64]
 
@@ -47,10 +47,11 @@ class Start(NamedTuple):
 
 
 class _Solution(NamedTuple):
-    """Coefficients of A and V by term, K, viscous friction, M at the samples, and sizes of forces."""
+    """Coefficients of A and V by term, K, offsets, viscous friction, M at the samples, sizes of forces."""
 
     functions: dict[tuple[str, int, int], Array]
     coupling: Array
+    offset: Array
     viscous: Array
     mass: Float[Array, "B n n"]
     forces: Float[Array, " n"]
@@ -72,17 +73,22 @@ def linear_start(layout: Layout, data: Assembly, seed: int) -> Start:
     output = weights["lagrangian.output"]
     for block, columns in zip(layout.blocks, layout.columns, strict=True):
         mass, epsilon[block] = _mass_block(found.mass[:, block][:, :, block], found.forces[block])
-        factor = fit_factor(mass, part.basis, columns, random)
+        used = np.flatnonzero(layout.term_mask(("L", block[0], 0), layout.products))
+        factor = fit_factor(mass, part.basis[:, used], columns, random)
         for k, i in enumerate(block):
-            output[layout.rows[i], : factor.shape[2]] = factor[k]
+            output[layout.rows[i], used] = factor[k]
     for row, term in enumerate(layout.outputs):
         if term in found.functions:
             output[row, 1 : 1 + len(found.functions[term])] = found.functions[term]
     weights["lagrangian.coupling"][:] = found.coupling
+    weights["lagrangian.offset"][:] = found.offset
     viscous = np.where(found.viscous > LEAST * found.forces, found.viscous, PLAIN * LEAST * found.forces)
     weights["dissipation.viscous"][:] = np.sqrt(viscous)
     weights["dissipation.friction"][:] = JOIN * np.sqrt(viscous)[:, None]
-    weights["dissipation.width"][:] = np.log(np.geomspace(0.1, 1.0, layout.friction))
+    smooth = layout.friction - layout.bumps
+    weights["dissipation.width"][:, :smooth] = np.log(np.geomspace(0.1, 1.0, smooth))
+    weights["dissipation.width"][:, smooth:] = np.log(0.1)
+    weights["dissipation.quadratic"][:] = JOIN * np.sqrt(viscous)
     # Each unit's transition lies somewhere in the range of its inputs, which is [-1, 1].
     slope = weights["lagrangian.hidden.weight"]
     slope[:] = 1.5 * random.standard_normal(slope.shape)
@@ -92,18 +98,25 @@ def linear_start(layout: Layout, data: Assembly, seed: int) -> Start:
 
 def _solve(layout: Layout, part: Assembly) -> _Solution:
     """Weighted linear least squares for everything at once."""
-    n = part.velocity.shape[1]
+    n, free = part.velocity.shape[1], layout.free
     pairs = list(combinations_with_replacement(range(part.z.shape[1]), 2))
     bases, columns = [], []
-    for t, (kind, _, _) in enumerate(layout.terms):
-        if kind == "M":
+    for t, term in enumerate(layout.terms):
+        if term[0] == "M":
+            used = layout.term_mask(term, pairs)
             basis, slopes = product_basis(part.z, pairs)
         else:  # constants have no effect there
+            used = layout.term_mask(term, layout.products)[1:]
             basis, slopes = part.basis[:, 1:], part.slopes[:, 1:]
+        basis, slopes = basis * used, slopes * used[:, None]
         column = part.value[:, :, t, None] * basis[:, None]
         columns.append(column + np.einsum("bnz,bhz->bnh", part.gradient[:, :, t], slopes))
         bases.append(basis)
-    columns += [coupling_columns(layout, part.velocity), part.velocity[:, :, None] * np.eye(n)]
+    columns += [
+        coupling_columns(layout, part.velocity) * free["lagrangian.coupling"],
+        -np.broadcast_to(np.eye(n), (len(part), n, n)) * free["lagrangian.offset"],
+        part.velocity[:, :, None] * np.eye(n) * free["dissipation.viscous"],
+    ]
     size = np.sqrt(np.mean(part.target**2, axis=0))
     weight = 1 / np.where(size > 0, size, 1)
     matrix = (np.concatenate(columns, axis=2) * weight[:, None]).reshape(part.target.size, -1)
@@ -119,7 +132,8 @@ def _solve(layout: Layout, part: Assembly) -> _Solution:
     forces = np.max([np.sqrt(np.mean(share**2, axis=0)) for share in shares], axis=0)
     forces = np.maximum(forces, np.finfo(float).eps * forces.max())
     functions = {term: x for term, x in zip(layout.terms, parts, strict=False) if term[0] != "M"}
-    return _Solution(functions, parts[-2], parts[-1], mass, forces)
+    coupling, offset, viscous = parts[-3:]
+    return _Solution(functions, coupling, offset, viscous, mass, forces)
 
 
 def _mass_block(

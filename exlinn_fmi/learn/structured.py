@@ -29,6 +29,7 @@ from exlinn_fmi.learn.levenberg import Normal, levenberg_marquardt
 from exlinn_fmi.learn.networks import StructuredNetworks
 from exlinn_fmi.learn.start import Start, linear_start
 from exlinn_fmi.mechanics.learned import ModelSpec
+from exlinn_fmi.mechanics.structure import UNKNOWN, Structure
 from exlinn_fmi.scenario.learning import Structured
 
 Array = NDArray[np.float64]
@@ -149,17 +150,22 @@ class _Objective:
         )
 
 
-def structured_spec(train: Dataset, options: Structured, seed: int) -> tuple[ModelSpec, Start]:
+def structured_spec(
+    train: Dataset, options: Structured, seed: int, structure: Structure = UNKNOWN
+) -> tuple[ModelSpec, Start]:
     """The model to train and its first weights.
 
     Args:
         train: data that excite all coordinates.
         options: the learner's settings.
         seed: of what is drawn.
+        structure: what is known of the plant.
     """
     scales = data_scales(train.arrays, train.coordinates)
     n = len(train.coordinates)
-    spec = ModelSpec("structured", train.coordinates, options.hidden, scales, epsilon=(0.0,) * n)
+    spec = ModelSpec(
+        "structured", train.coordinates, options.hidden, scales, epsilon=(0.0,) * n, structure=structure
+    )
     start = linear_start(spec.layout, inverse_assembly(spec, train.arrays), seed)
     return replace(spec, epsilon=start.epsilon), start
 

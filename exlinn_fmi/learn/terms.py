@@ -25,6 +25,7 @@ from exlinn_fmi.learn.trajectory import Fit, Information, Shooting, cut, even
 from exlinn_fmi.learn.weak import OVERLAP, Regression, inverse_regression, weak_regression
 from exlinn_fmi.mechanics.learned import ModelSpec
 from exlinn_fmi.mechanics.monomials import MonomialBasis
+from exlinn_fmi.mechanics.structure import UNKNOWN, Structure
 from exlinn_fmi.scenario.learning import Objective, Terms
 
 Array = NDArray[np.float64]
@@ -39,12 +40,12 @@ LEAST_MISFIT = 1e-6
 """Terms are judged as if forces had at least this noise, as a share of their size."""
 
 
-def terms_spec(train: Dataset, options: Terms) -> ModelSpec:
-    """The model to train: the user's candidates, or generic ones."""
+def terms_spec(train: Dataset, options: Terms, structure: Structure = UNKNOWN) -> ModelSpec:
+    """The model to train: the user's candidates, or generic ones that what is known of the plant leaves."""
     if options.lagrangian:
         basis = MonomialBasis(train.coordinates, tuple(options.lagrangian), tuple(options.dissipation))
     else:
-        basis = generic_basis(train)
+        basis = generic_basis(train, structure)
     return ModelSpec(
         "terms",
         train.coordinates,

@@ -19,6 +19,7 @@ from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.learned import ModelSpec, learned_system
+from exlinn_fmi.mechanics.structure import UNKNOWN, Structure
 from exlinn_fmi.scenario.learning import Objective, Paper, Structured, Terms
 
 Status = Literal["converged", "iterations", "interrupted"]
@@ -82,6 +83,7 @@ def train(
     progress: Callable[[TrainProgress], None] | None = None,
     should_stop: Callable[[], bool] = lambda: False,
     objective: Objective = "auto",
+    structure: Structure = UNKNOWN,
 ) -> TrainedModel:
     """Fit a model; keep the weights that are best on the validation data.
 
@@ -93,6 +95,7 @@ def train(
         progress: told after each iteration.
         should_stop: asked after each iteration; the best weights so far are kept then.
         objective: what a learner that has the choice makes small.
+        structure: what is known of the plant's energies, friction and constant forces.
 
     Raises:
         DataError: nothing can be learned from the data.
@@ -100,7 +103,7 @@ def train(
     """
     check_excitation(train)
     began = time.perf_counter()
-    spec, iterates, total = _learner(train, validation, method, seed, objective)
+    spec, iterates, total = _learner(train, validation, method, seed, objective, structure)
     best: Iterate | None = None
     status: Status = "converged"
     rows: list[tuple[int, str, float, float, float]] = []
@@ -134,7 +137,12 @@ def train(
 
 
 def _learner(
-    train: Dataset, validation: Dataset, method: Structured | Terms | Paper, seed: int, objective: Objective
+    train: Dataset,
+    validation: Dataset,
+    method: Structured | Terms | Paper,
+    seed: int,
+    objective: Objective,
+    structure: Structure,
 ) -> tuple[ModelSpec, Iterator[Iterate], int]:
     """The model, its iterates, and the most iterations."""
     if isinstance(method, Paper):
@@ -148,11 +156,11 @@ def _learner(
     if isinstance(method, Terms):
         from exlinn_fmi.learn.terms import STAGES, iterate_terms, terms_spec
 
-        spec = terms_spec(train, method)
+        spec = terms_spec(train, method, structure)
         return spec, iterate_terms(spec, train, validation, objective), STAGES
     from exlinn_fmi.learn.structured import iterate_structured, structured_spec
 
-    spec, start = structured_spec(train, method, seed)
+    spec, start = structured_spec(train, method, seed, structure)
     return spec, iterate_structured(spec, start, train, validation, method), method.iterations
 
 

@@ -16,3 +16,12 @@ def log_cosh(x: Symbol) -> Symbol:
     # |x| with a sign that AD takes for constant, so that the second derivative at 0 is 1 and not 0.
     size = x * (2 * (x >= 0) - 1)
     return size + ca.log1p(ca.exp(-2 * size)) - np.log(2)
+
+
+def stribeck(x: Symbol) -> Symbol:
+    """1 − exp(−x²/2): its derivative x exp(−x²/2) rises to a peak at x = 1 and is gone beyond x = 4.
+
+    D = F s · stribeck(v/s) is what friction has at low speeds and loses at higher ones, beside Coulomb's. It
+    dissipates at any speed, v ∂D/∂v ≥ 0, but is not convex: the force falls beyond the peak.
+    """
+    return 1 - ca.exp(-(x**2) / 2)

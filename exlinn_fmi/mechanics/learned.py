@@ -6,7 +6,9 @@ Two forms of two networks (𝓛 and D) that are trained together, and one withou
     𝓛 = ½ q̇ᵀM(q)q̇ + (Kq + A(q))ᵀq̇ − V(q) with M = L(q)L(q)ᵀ + ε ≻ 0, apart for mechanical and electrical
     coordinates. L, A and V are the outputs of one network with a hidden tanh layer and a direct path; K is a
     strictly triangular constant (a coupling like k_e·Q̇·α is linear in q, which no periodic function holds).
-    D = Σᵢ ½ bᵢ² q̇ᵢ² + Σₖ aᵢₖ² sᵢₖ² log cosh(q̇ᵢ/sᵢₖ): convex, D(0) = 0, D'(0) = 0, of bounded curvature.
+    D = Σᵢ ½ bᵢ² q̇ᵢ² + Σₖ aᵢₖ² sᵢₖ² log cosh(q̇ᵢ/sᵢₖ): convex, D(0) = 0, D'(0) = 0, of bounded curvature;
+    where the user says so with dᵢ² |q̇ᵢ|³/3 and with Stribeck's bump in place of a log cosh, which dissipates
+    at any speed, too. A constant force oᵢ of unknown size is oᵢ qᵢ in 𝓛.
     Positions of lines saturate far outside the data (`saturate`), so that M and V are bounded everywhere:
     with M ≻ 0 and viscous friction, bounded inputs then move the model at bounded velocities for ever.
 ``features``
@@ -23,7 +25,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from itertools import combinations_with_replacement, pairwise
 from typing import Any, Literal
 
 import casadi as ca
@@ -33,8 +34,10 @@ from numpy.typing import NDArray
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate, check_coordinates
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, Symbol
-from exlinn_fmi.mechanics.friction import log_cosh
+from exlinn_fmi.mechanics.friction import log_cosh, stribeck
+from exlinn_fmi.mechanics.layout import Layout
 from exlinn_fmi.mechanics.monomials import MonomialBasis
+from exlinn_fmi.mechanics.structure import UNKNOWN, Structure
 
 Weights = Mapping[str, NDArray[np.float64]]
 
@@ -92,6 +95,7 @@ class ModelSpec:
         epsilon: smallest dimensionless mass of each coordinate (structured), shape (n,).
         lagrangian_features: monomials for 𝓛 (features and terms).
         dissipation_features: monomials for D (features and terms).
+        structure: which energies the plant has; what it has not, the structured networks have not either.
     """
 
     form: Literal["structured", "features", "terms"]
@@ -101,6 +105,7 @@ class ModelSpec:
     epsilon: tuple[float, ...] = ()
     lagrangian_features: tuple[str, ...] = ()
     dissipation_features: tuple[str, ...] = ()
+    structure: Structure = UNKNOWN
 
     def __post_init__(self) -> None:
         check_coordinates(self.coordinates)
@@ -119,6 +124,7 @@ class ModelSpec:
         try:
             plain: dict[str, Any] = _with_tuples(data)
             plain["coordinates"] = tuple(Coordinate(**c) for c in data["coordinates"])
+            plain["structure"] = Structure(**_with_tuples(data["structure"]))
             if plain.get("scales") is not None:
                 plain["scales"] = Scales(**_with_tuples(data["scales"]))
             spec = cls(**plain)
@@ -161,100 +167,11 @@ class ModelSpec:
 
 def _with_tuples(data: Mapping[str, Any]) -> dict[str, Any]:
     """JSON's lists as tuples."""
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
 
+    def tuples(value: Any) -> Any:
+        return tuple(map(tuples, value)) if isinstance(value, list) else value
 
-class Layout:
-    """Sizes and index sets of the structured networks, derived from the coordinates alone.
-
-    Network inputs z are the topology features: sin and cos of a circle, the scaled position of a line,
-    nothing of a cyclic coordinate. Each output is linear in the basis [1, z, products, tanh(Wz + b)].
-
-    Attributes:
-        positions: coordinates that are not cyclic.
-        owners: for each feature z the coordinate that it comes from.
-        products: two or three features that are multiplied: of different coordinates, or of a line.
-        blocks: members of each diagonal block of M.
-        columns: number of columns of L in each block.
-        terms: the functions of q in 𝓛: ("M", i, j), ("A", i, i) and ("V", 0, 0).
-        outputs: the network's outputs: ("L", i, column), ("A", i, i), ("V", 0, 0).
-        rows: for each coordinate the outputs that are its row of L.
-        couplings: (i, j) for each constant K_ij q_j q̇_i.
-    """
-
-    def __init__(self, spec: ModelSpec) -> None:
-        kinds = [c.kind for c in spec.coordinates]
-        n = len(kinds)
-        topologies = [c.topology for c in spec.coordinates]
-        self.positions = [i for i in range(n) if topologies[i] != "cyclic"]
-        self.owners = [i for i in self.positions for _ in range(2 if topologies[i] == "circle" else 1)]
-        self.products = [
-            product
-            for degree in (2, 3)
-            for product in combinations_with_replacement(range(len(self.owners)), degree)
-            if all(
-                self.owners[a] != self.owners[b] or topologies[self.owners[a]] == "line"
-                for a, b in pairwise(product)
-            )
-        ]
-        blocks = [[i for i in range(n) if kinds[i] == kind] for kind in ("mechanical", "electrical")]
-        self.blocks = [block for block in blocks if block]
-        self.columns = [len(block) + len(self.positions) for block in self.blocks]
-        # One component of A can be gauged away: 𝓛 + d/dt χ(q) has the same equations of motion.
-        free = [i for i in range(n) if i not in self.positions[:1]] if self.positions else []
-        self.terms: list[tuple[str, int, int]] = [
-            ("M", *ij) for block in self.blocks for ij in combinations_with_replacement(block, 2)
-        ]
-        self.terms += [("A", i, i) for i in free] + [("V", 0, 0)] * bool(self.positions)
-        self.outputs: list[tuple[str, int, int]] = [
-            ("L", i, c)
-            for block, columns in zip(self.blocks, self.columns, strict=True)
-            for i in block
-            for c in range(columns)
-        ]
-        self.outputs += [term for term in self.terms if term[0] != "M"]
-        self.rows = {
-            i: slice(self.outputs.index(("L", i, 0)), self.outputs.index(("L", i, columns - 1)) + 1)
-            for block, columns in zip(self.blocks, self.columns, strict=True)
-            for i in block
-        }
-        # K_ij q_j q̇_i and K_ji q_i q̇_j differ by a gauge: write it with a q that is no charge if there is
-        # one.
-        order = sorted(range(n), key=lambda i: (topologies[i] == "cyclic", kinds[i] == "electrical", i))
-        self.couplings = [(order[b], order[a]) for a in range(n) for b in range(a + 1, n)]
-        self.hidden = spec.hidden if self.positions else 0
-        self.basis = 1 + len(self.owners) + len(self.products) + self.hidden
-        self.friction = -(-spec.hidden // n)
-
-    @property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of each weight array."""
-        n = sum(len(block) for block in self.blocks)
-        return {
-            "lagrangian.hidden.weight": (self.hidden, len(self.owners)),
-            "lagrangian.hidden.bias": (self.hidden,),
-            "lagrangian.output": (len(self.outputs), self.basis),
-            "lagrangian.coupling": (len(self.couplings),),
-            "dissipation.viscous": (n,),
-            "dissipation.friction": (n, self.friction),
-            "dissipation.width": (n, self.friction),
-        }
-
-    @property
-    def free(self) -> dict[str, NDArray[np.bool_]]:
-        """Which weights are trained: constants in A and V have no effect and stay 0."""
-        masks = {name: np.ones(shape, dtype=bool) for name, shape in self.shapes.items()}
-        masks["lagrangian.output"][[kind != "L" for kind, _, _ in self.outputs], 0] = False
-        return masks
-
-    @property
-    def direct(self) -> dict[str, NDArray[np.bool_]]:
-        """Those of the free weights that need no hidden unit: the direct path, K and viscous friction."""
-        masks = self.free
-        masks["lagrangian.output"][:, self.basis - self.hidden :] = False
-        for name in masks.keys() - {"lagrangian.output", "lagrangian.coupling", "dissipation.viscous"}:
-            masks[name][:] = False
-        return masks
+    return {key: tuples(value) for key, value in data.items()}
 
 
 def angular(coordinate: Coordinate) -> float:
@@ -368,6 +285,7 @@ def _structured_lagrangian(spec: ModelSpec, weights: Weights, q: Symbol, v: Symb
     energy += sum(m**2 for m in momentum.values()) / 2 + ca.dot(ca.DM(spec.epsilon), w**2) / 2
     for k, (i, j) in enumerate(layout.couplings):
         energy += float(weights["lagrangian.coupling"][k]) * x[j] * w[i]
+    energy += ca.dot(ca.DM(weights["lagrangian.offset"]), x)
     return scales.energy * energy
 
 
@@ -375,13 +293,14 @@ def _structured_dissipation(spec: ModelSpec, weights: Weights, v: Symbol) -> Sym
     """D of the structured form [W]."""
     assert spec.scales is not None
     viscous, friction = weights["dissipation.viscous"], weights["dissipation.friction"]
-    width = friction_width(weights)
+    width, quadratic = friction_width(weights), weights["dissipation.quadratic"]
+    smooth = spec.layout.friction - spec.layout.bumps
     power = ca.SX(0)
     for i, unit in enumerate(spec.scales.velocity):
         w = v[i] / unit
-        power += viscous[i] ** 2 / 2 * w**2
-        for a, s in zip(friction[i], width[i], strict=True):
-            power += (a * s) ** 2 * log_cosh(w / s)
+        power += viscous[i] ** 2 / 2 * w**2 + quadratic[i] ** 2 / 3 * ca.fabs(w) ** 3
+        for k, (a, s) in enumerate(zip(friction[i], width[i], strict=True)):
+            power += (a * s) ** 2 * (log_cosh if k < smooth else stribeck)(w / s)
     return spec.scales.energy / spec.scales.time * power
 
 

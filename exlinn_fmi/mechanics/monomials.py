@@ -1,9 +1,9 @@
 """Monomials such as ``0.5*sin(alpha)^2*alpha_dot^2``: how a user names features and physical parameters.
 
 Grammar: ``[number*]factor(*factor)*`` with factor = ``name`` | ``function(argument)``, each with optional
-``^integer``; function = ``sin`` | ``cos`` | ``abs`` | ``logcosh`` | ``T1`` … ``T9`` (Chebyshev), argument =
-``[number*]name[±number]``. The same text serves as a feature of the paper's networks, as a term of 𝓛 or D
-that a parameter multiplies, and as a product of parameters (``m_c*d^2``).
+``^integer``; function = ``sin`` | ``cos`` | ``abs`` | ``logcosh`` | ``stribeck`` | ``T1`` … ``T9``
+(Chebyshev), argument = ``[number*]name[±number]``. The same text serves as a feature of the paper's networks,
+as a term of 𝓛 or D that a parameter multiplies, and as a product of parameters (``m_c*d^2``).
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate, Parameter
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, Symbol
-from exlinn_fmi.mechanics.friction import log_cosh
+from exlinn_fmi.mechanics.friction import log_cosh, stribeck
 
 _DIGITS = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _NUMBER = re.compile(rf"[+-]?{_DIGITS}")
 _FACTOR = re.compile(
-    rf"(?:(?P<function>sin|cos|abs|logcosh|T[1-9])\((?:(?P<scale>[+-]?{_DIGITS})\*)?(?P<argument>[A-Za-z_]\w*)"
+    rf"(?:(?P<function>sin|cos|abs|logcosh|stribeck|T[1-9])\((?:(?P<scale>[+-]?{_DIGITS})\*)?(?P<argument>[A-Za-z_]\w*)"
     rf"(?P<shift>[+-]{_DIGITS})?\)|(?P<name>[A-Za-z_]\w*))(?:\^(?P<power>-?\d+))?"
 )
 _TIMES = re.compile(r"\*(?![^(]*\))")
@@ -57,6 +57,8 @@ class Factor:
                 return ca.fabs(at)
             case "logcosh":
                 return log_cosh(at)
+            case "stribeck":
+                return stribeck(at)
         before, now = 1, at  # T_{k+1} = 2x T_k − T_{k−1}
         for _ in range(int(self.function[1:]) - 1):
             before, now = now, 2 * at * now - before
@@ -100,8 +102,8 @@ def parse_monomial(text: str, names: Collection[str]) -> Monomial:
         if match is None:
             raise ModelError(
                 f"monomial {text!r}: {part or 'nothing'!r} is not a factor; expected [number*]factor*factor… "
-                "with factor = name, sin(name), cos(name), abs(name) or logcosh(name), each with an optional "
-                "^integer"
+                "with factor = name, sin(name), cos(name), abs(name), logcosh(name) or stribeck(name), each "
+                "with an optional ^integer"
             )
         name = match["argument"] or match["name"]
         if name not in names:
@@ -111,6 +113,28 @@ def parse_monomial(text: str, names: Collection[str]) -> Monomial:
     if not factors:
         raise ModelError(f"monomial {text!r}: expected at least one name, found only a number")
     return Monomial(float(parts[0]) if number else 1.0, tuple(factors))
+
+
+def parse_term(text: str, coordinates: tuple[Coordinate, ...], dissipation: bool = False) -> Monomial:
+    """Read a term of 𝓛 or D.
+
+    A cyclic position may stand alone, times a number: then its coefficient is a constant force on it.
+
+    Args:
+        text: the monomial.
+        coordinates: the generalised coordinates, whose names may occur.
+        dissipation: whether it is a term of D, where only velocities may.
+
+    Raises:
+        ModelError: the text does not follow the grammar, or a name may not occur.
+    """
+    velocities = [c.velocity for c in coordinates]
+    if dissipation:
+        return parse_monomial(text, velocities)
+    parts = "".join(text.split()).split("*")
+    alone = [c.name for c in coordinates if c.name == parts[-1] and not any(map(_FACTOR.match, parts[:-1]))]
+    positions = [c.name for c in coordinates if c.topology != "cyclic"]
+    return parse_monomial(text, [*positions, *alone, *velocities])
 
 
 def _suggest(name: str, names: Collection[str]) -> str:
@@ -141,11 +165,9 @@ class MonomialBasis:
         self._monomials()
 
     def _monomials(self) -> tuple[list[Monomial], list[Monomial]]:
-        velocities = [c.velocity for c in self.coordinates]
-        names = [c.name for c in self.coordinates if c.topology != "cyclic"] + velocities
         return (
-            [parse_monomial(text, names) for text in self.lagrangian],
-            [parse_monomial(text, velocities) for text in self.dissipation],
+            [parse_term(text, self.coordinates) for text in self.lagrangian],
+            [parse_term(text, self.coordinates, dissipation=True) for text in self.dissipation],
         )
 
     def expressions(self, q: Symbol, v: Symbol) -> tuple[Symbol, Symbol]:

@@ -195,13 +195,11 @@ def _monomials(learn: AnyLearn, coordinates: tuple[Coordinate, ...]) -> Iterator
     """Features and terms that cannot be read, or that name what the model does not have."""
     if not coordinates:
         return
-    from exlinn_fmi.mechanics.monomials import parse_monomial
+    from exlinn_fmi.mechanics.monomials import parse_term
 
-    velocities = [c.velocity for c in coordinates]
-    names = [c.name for c in coordinates if c.topology != "cyclic"] + velocities
     for at, text in _terms(learn.method, learn.identify):
         try:
-            parse_monomial(text, velocities if "dissipation" in str(at[2]) else names)
+            parse_term(text, coordinates, dissipation="dissipation" in str(at[2]))
         except ModelError as error:
             yield at, str(error)
 

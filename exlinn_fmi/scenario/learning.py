@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag
 
 from exlinn_fmi.mechanics.coordinates import Coordinate, Kind, Topology
+from exlinn_fmi.mechanics.structure import Coupling, Friction, Structure
 from exlinn_fmi.scenario.signals import Signal
 from exlinn_fmi.scenario.spec import (
     Band,
@@ -22,6 +23,9 @@ from exlinn_fmi.scenario.spec import (
     telling_key,
 )
 
+STRUCTURE = {"friction", "offset"}
+"""Keys of a coordinate that tell how it is learned, not what is measured."""
+
 
 class CoordinateSpec(Spec):
     """A generalised coordinate of the model to learn."""
@@ -35,6 +39,13 @@ class CoordinateSpec(Spec):
     )
     velocity_unit: str = Field("", description="unit of q̇; <unit>/s if not given")
     input_unit: str = Field("", description="unit of the input")
+    friction: list[Friction] | None = Field(
+        None,
+        description="kinds of friction that act on q̇, [] for none; if not given, any that grows with speed",
+    )
+    offset: bool = Field(
+        False, description="whether a constant force of unknown size acts on q beside the input"
+    )
 
 
 class PlantCoordinate(CoordinateSpec):
@@ -77,7 +88,7 @@ class DataCoordinate(CoordinateSpec):
 
     def coordinate(self) -> Coordinate:
         """The coordinate by the names of its quantities."""
-        return Coordinate(**self.model_dump(exclude_none=True))
+        return Coordinate(**self.model_dump(exclude_none=True, exclude=STRUCTURE))
 
 
 class Experiment(Spec):
@@ -216,8 +227,21 @@ class Identify(Spec):
         return [*self.lagrangian, *self.dissipation]
 
 
+class EnergiesSpec(Spec):
+    """Energies that the plant has; what is left out here, the model has not either."""
+
+    potential: bool = Field(True, description="whether mechanical positions store energy: gravity, springs")
+    coupling: Coupling = Field(
+        "any",
+        description="between mechanical and electrical coordinates: `magnetic` (inductance L(x), flux), "
+        "`electric` (capacitance C(x)), `none`; `any` where that is not known",
+    )
+
+
 class Learn(Spec):
     """What the learning of a model takes, wherever the data come from."""
+
+    coordinates: Sequence[CoordinateSpec]
 
     train_fraction: float = Field(
         0.8, gt=0, lt=1, description="share of the training data to fit; the rest validates"
@@ -232,10 +256,23 @@ class Learn(Spec):
         "accelerations; `weak`: those against test functions, without accelerations; `trajectory`: errors of "
         "predicted states, best under noise; `auto`: as the noise calls for",
     )
+    energies: EnergiesSpec = Field(
+        default_factory=lambda: EnergiesSpec(), description="energies that the plant has, as far as known"
+    )
     identify: Identify = Field(
         default_factory=lambda: Identify(), description="physical parameters to read off"
     )
     seed: int | None = Field(None, ge=0, description="seed of split and weights; the scenario's if not given")
+
+    @property
+    def structure(self) -> Structure:
+        """What is known of the plant before it is learned."""
+        return Structure(
+            self.energies.potential,
+            self.energies.coupling,
+            tuple(None if c.friction is None else tuple(c.friction) for c in self.coordinates),
+            tuple(c.offset for c in self.coordinates),
+        )
 
 
 class Noise(Spec):

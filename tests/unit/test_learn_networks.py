@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,6 +16,7 @@ from exlinn_fmi.learn.networks import StructuredNetworks
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
 from exlinn_fmi.mechanics.learned import ModelSpec, learned_system
+from exlinn_fmi.mechanics.structure import Structure
 
 CIRCLE = Coordinate("phi", "rad", topology="circle")
 DEGREES = Coordinate("theta", "deg", topology="circle")
@@ -172,3 +175,73 @@ def test_weights_that_are_not_finite_are_refused() -> None:
     spec, weights = random_model(15, SYSTEMS[0])
     with pytest.raises(ModelError, match="not finite"):
         learned_system(spec, {**weights, "dissipation.viscous": np.array([np.nan, 1.0])})
+
+
+# ── structure that the user knows ────────────────────────────────────────────────────────────────────────
+
+KNOWN = Structure(
+    potential=False,
+    coupling="magnetic",
+    friction=(("viscous", "stribeck", "quadratic"), ("viscous", "coulomb")),
+    offset=(True, False),
+)
+
+
+def known_model(seed: int, coordinates: tuple[Coordinate, ...], structure: Structure) -> tuple:
+    """A random model of a known structure."""
+    spec, _ = random_model(seed, coordinates)
+    spec = dataclasses.replace(spec, structure=structure)
+    random = np.random.default_rng(seed)
+    free = spec.layout.free.items()
+    return spec, {name: np.where(mask, random.standard_normal(mask.shape), 0.0) for name, mask in free}
+
+
+@pytest.mark.parametrize("coordinates", [(LINE, STORED), (CIRCLE, CHARGE)])
+def test_numpy_and_casadi_agree_on_any_structure(coordinates: tuple[Coordinate, ...]) -> None:
+    spec, weights = known_model(20, coordinates, KNOWN)
+    samples = random_samples(21, coordinates)
+    networks = StructuredNetworks(spec)
+    theta, data = networks.pack(weights), inverse_assembly(spec, samples)
+    force = networks.residual(theta, data) * spec.scales.force + samples.F
+    assert force == pytest.approx(
+        evaluate(learned_system(spec, weights).inverse, *samples[:3], np.zeros(0)), rel=1e-9
+    )
+    residual, jacobian = networks.jacobian(theta, data)
+    gradient = networks.gradient(theta, data)[1]
+    assert gradient == pytest.approx(2 * np.einsum("bn,bnp->p", residual, jacobian) / residual.size)
+    for k, step in enumerate(np.eye(networks.size) * 1e-6):
+        difference = (networks.residual(theta + step, data) - networks.residual(theta - step, data)) / 2e-6
+        assert jacobian[:, :, k] == pytest.approx(difference, rel=1e-5, abs=1e-7 * np.abs(jacobian).max())
+
+
+def test_energies_that_the_plant_has_not_the_model_has_not_either() -> None:
+    spec, weights = known_model(22, (LINE, STORED), KNOWN)
+    system, (q, v, _, _) = learned_system(spec, weights), random_samples(23, (LINE, STORED))
+    moved, rest, none = q + np.array([0.7, 0.0]), np.zeros_like(v), np.zeros(0)
+    energy = [evaluate(system.energy, at, rest, none) for at in (q, moved)]
+    pushed = spec.scales.energy / spec.scales.position[0] * weights["lagrangian.offset"][0]
+    assert energy[1] - energy[0] == pytest.approx(-0.7 * pushed * np.ones_like(energy[0]))  # no V(x), no C(x)
+    charged = q + np.array([0.0, 0.7])
+    mass = [evaluate(system.mass_matrix, at, v, none).reshape(-1, 2, 2) for at in (q, charged, moved)]
+    assert mass[0][:, 0, 0] == pytest.approx(mass[1][:, 0, 0])  # inertia knows nothing of charges,
+    assert np.abs(mass[0][:, 1, 1] - mass[2][:, 1, 1]).max() > 1e-6  # but the inductance is L(x)
+
+
+def test_without_coupling_the_parts_do_not_know_of_each_other() -> None:
+    spec, weights = known_model(24, (LINE, STORED), Structure(coupling="none"))
+    system, samples = learned_system(spec, weights), random_samples(25, (LINE, STORED))
+    force = [
+        evaluate(system.inverse, *(x * np.array([1.0, k]) for x in samples[:3]), np.zeros(0))[:, 0]
+        for k in (1.0, 2.0)
+    ]
+    assert force[0] == pytest.approx(force[1])
+
+
+@settings(max_examples=20, deadline=None)
+@given(SEEDS, st.floats(-50, 50))
+def test_all_friction_dissipates_at_any_speed(seed: int, speed: float) -> None:
+    kinds = ("viscous", "coulomb", "stribeck", "quadratic")
+    spec, weights = known_model(seed, (LINE,), Structure(friction=(kinds,)))
+    system = learned_system(spec, weights)
+    assert float(system.power([speed], [0.0], [])[1]) >= 0
+    assert float(system.dissipation([speed], [])) >= 0
