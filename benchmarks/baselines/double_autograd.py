@@ -39,7 +39,8 @@ class DoubleAutograd:
 
     def gradient(self, q: Tensor, w: Tensor, a: Tensor, force: Tensor) -> dict[str, Tensor]:
         """Of the loss, by each weight array."""
-        found = torch.autograd.grad(self.loss(q, w, a, force), list(self.weights.values()))
+        weights = list(self.weights.values())  # offsets and drag, which are optional, are left out
+        found = torch.autograd.grad(self.loss(q, w, a, force), weights, materialize_grads=True)
         return dict(zip(self.weights, found, strict=True))
 
     def residual(self, q: Tensor, w: Tensor, a: Tensor, force: Tensor) -> Tensor:
