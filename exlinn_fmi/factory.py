@@ -65,10 +65,12 @@ def build(name: str, scenario: Scenario, folder: Path, run_folder: Path) -> Comp
     from exlinn_fmi.control.controller import NmpcController
 
     # An input that is connected to nothing acts on nothing: the controller must not count on it.
-    driven = {path.split(".", 1)[1] for path, _ in scenario.connection_list() if path.startswith(f"{name}.")}
+    links, own = scenario.connection_list(), f"{name}."
+    driven = {source.removeprefix(own) for source, _ in links if source.startswith(own)}
+    measured = {target.removeprefix(own) for _, target in links if target.startswith(own)}
     system = model_system(spec.nmpc.model, folder, run_folder).with_inputs(driven)
     step = spec.step or (scenario.simulate.step if scenario.simulate else 1e-3)
-    return NmpcController(name, system, spec.nmpc, step, folder)
+    return NmpcController(name, system, spec.nmpc, step, folder, measured)
 
 
 def make(name: str, spec: ComponentBase, folder: Path, run_folder: Path) -> Component:

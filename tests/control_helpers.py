@@ -98,7 +98,7 @@ def generator(
 def problem(system: LagrangianSystem, kind: str = "sqp", **options: Any) -> tuple[Solver, ReferenceGenerator]:
     """A solver with its references."""
     settings = Nmpc(**({"reference": CART} | options))
-    made = generator(system, settings.reference, settings.horizon)
+    made = generator(system, settings.reference, settings.horizon or 30)
     ocp = Ocp(system, settings, STEP, made.states)
     return make_solver(ocp, kind, settings.iterations, settings.tolerance), made
 

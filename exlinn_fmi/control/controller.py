@@ -1,17 +1,18 @@
 """The NMPC controller as a component: Algorithm 1 (measure, infer the model, solve, apply the first input).
 
 It is sampled and feeds through directly: at each of its ticks the outputs answer the measurements set at that
-very tick. The solve takes place when an output is first read, and again only if a measurement is changed
-before the step; `step` keeps the result as what the next tick starts from.
+very tick, unless `delay: computation` has them answer those of the tick before. The solve takes place when an
+output is first read, and again only if a measurement is changed before the step; `step` keeps the result as
+what the next tick starts from.
 
-Where a solve fails, or a measurement is not finite, the previous plan goes on, shifted, as long as it has
-inputs left; then `safe_input` is applied. Both are counted and reported, and no output is ever NaN or out
-of bounds.
+A measurement that is not finite is replaced by what the estimator expects. Where a solve fails the previous
+plan goes on, shifted, as long as it has inputs left; then `safe_input` is applied. All this is counted and
+reported, and no output is ever NaN or out of bounds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -20,8 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values
+from exlinn_fmi.control.defaults import completed, estimator, measure
 from exlinn_fmi.control.diagnosis import diagnose
-from exlinn_fmi.control.ocp import Ocp, check_names
+from exlinn_fmi.control.estimator import Belief
+from exlinn_fmi.control.ocp import HORIZON, Ocp, check_names
 from exlinn_fmi.control.reference import ReferenceGenerator, References
 from exlinn_fmi.control.solver import Plan, Solution, SolveStatus, make_solver
 from exlinn_fmi.errors import InputError, ModelError, nearest
@@ -40,8 +43,12 @@ class _Memory:
         plan: guess for the coming tick, None where there is none.
         left: how many inputs of the plan are left to fall back on.
         references: the last reference.
+        belief: what is expected of the state that the coming measurements tell of, None where nothing is.
+        applied: the last input that was found.
         fallbacks: how often a fallback was needed so far.
         cost: last cost.
+        stage: its first term.
+        P: terminal weight of the last solve.
         kkt: last KKT residual.
         slack: last violation of a state bound.
     """
@@ -51,8 +58,12 @@ class _Memory:
     plan: Plan | None = None
     left: int = 0
     references: References | None = None
+    belief: Belief | None = None
+    applied: NDArray[np.float64] | None = None
     fallbacks: int = 0
     cost: float = 0.0
+    stage: float = 0.0
+    P: NDArray[np.float64] | None = None
     kkt: float = 0.0
     slack: float = 0.0
 
@@ -60,10 +71,11 @@ class _Memory:
 class NmpcController(Component):
     """Nonlinear model predictive controller around a Lagrangian system.
 
-    Inputs are the model's states, as measured. Outputs are its inputs, and how they came about: quantity
-    and states of the reference, cost, status (0 solved, 1 iteration limit, 2 failed: fallback applied),
-    iterations, KKT residual, time taken [s], fallbacks so far, largest violation of a softened bound over
-    its range.
+    Inputs are the model's states, as measured. Outputs are its inputs, and how they came about: quantities
+    and states of the reference, estimated state and disturbances, cost with its first term and what it may
+    have grown by a disturbance, status (0 solved, 1 iteration limit, 2 failed: fallback applied), missing
+    measurements, iterations, KKT residual, time taken [s], fallbacks so far, largest violation of a softened
+    bound over its range.
 
     Args:
         name: name in the scenario.
@@ -71,6 +83,7 @@ class NmpcController(Component):
         options: the controller's settings.
         step: sampling time [s].
         folder: folder of the scenario, which file names start from.
+        connected: states that something is connected to; all if not given.
 
     Attributes:
         warnings: what can be said against these settings before anything runs.
@@ -81,26 +94,40 @@ class NmpcController(Component):
         SolverError: the solver is not available.
     """
 
-    def __init__(self, name: str, system: LagrangianSystem, options: Nmpc, step: float, folder: Path) -> None:
+    def __init__(
+        self,
+        name: str,
+        system: LagrangianSystem,
+        options: Nmpc,
+        step: float,
+        folder: Path,
+        connected: Collection[str] | None = None,
+    ) -> None:
         self.name = name
         try:
-            self._generator = ReferenceGenerator(system, options.reference, folder, step, options.horizon)
-            self._ocp = Ocp(system, options, step, self._generator.states)
-            check_names("safe_input", options.safe_input, system.input_names)
+            sight = options.horizon or HORIZON
+            generator = ReferenceGenerator(system, options.reference, folder, step, sight)
+            check_names("safe_input", options.safe_input, system.input_names, "inputs")
+            sizes, first = measure(options, system, generator, step, sight)
+            options = completed(options, system, sizes, first, step)
+            self._ocp = Ocp(system, options, step, generator.states)
+            self._estimator = estimator(options, system, sizes, first, step, connected)
         except ModelError as error:
             raise ModelError(f"components.{name}.nmpc.{error}") from None
+        if self._ocp.horizon != sight:
+            generator = ReferenceGenerator(system, options.reference, folder, step, self._ocp.horizon)
+        self._generator = generator
+        self._late, self._slow = options.delay != "none", options.delay == "computation"
         self._solver = make_solver(self._ocp, options.solver, options.iterations, options.tolerance)
         self._step = step
         safe = np.array([options.safe_input.get(key, 0.0) for key in system.input_names])
         self._safe: NDArray[np.float64] = np.clip(safe, self._ocp.limits.u_min, self._ocp.limits.u_max)
         self.variables = nmpc_variables(system.coordinates, options)
-        self._measured = np.zeros(self._ocp.n)
+        self._measured, self._starts = np.zeros(self._ocp.n), np.zeros(self._ocp.n)
         self._outputs = np.zeros(len(self.variables) - self._ocp.n)
         self._memory = _Memory()
         self._following: _Memory | None = None
-        rest = np.zeros(self._ocp.n)
-        branch = self._generator.branch(rest)
-        self.warnings = diagnose(self._ocp, self._generator, self._generator.over(0.0, rest, branch))
+        self.warnings = diagnose(self._ocp, self._generator, first, self._estimator)
 
     @property
     def sampled(self) -> bool:
@@ -115,7 +142,7 @@ class NmpcController(Component):
     def enter_initialization(
         self, start_time: float, stop_time: float, starts: Mapping[str, float]
     ) -> Status:
-        """Begin afresh; `starts` may give measurements that nothing is connected to.
+        """Begin afresh; `starts` may give states that nothing is connected to, or that are not measured.
 
         Raises:
             InputError: a name in `starts` is no input.
@@ -129,6 +156,7 @@ class NmpcController(Component):
                 )
         self._generator.check(start_time, stop_time if np.isfinite(stop_time) else start_time)
         self._measured = np.array([float(starts.get(key, 0.0)) for key in names])
+        self._starts = self._measured.copy()
         self._memory, self._following = _Memory(time=start_time), None
         self.message = ""
         return Status.OK
@@ -139,7 +167,7 @@ class NmpcController(Component):
 
     def set(self, indices: Indices, values: Values) -> Status:
         """Set measurements; a changed one makes the outputs be computed again."""
-        if not np.array_equal(self._measured[indices], values):
+        if not np.array_equal(self._measured[indices], values, equal_nan=True):
             self._measured[indices] = values
             self._following = None
         return Status.OK
@@ -179,39 +207,96 @@ class NmpcController(Component):
     def _tick(self) -> Status:
         """One round of Algorithm 1 at the present tick."""
         begin, memory = perf_counter(), self._memory
-        usable = bool(np.isfinite(self._measured).all())
-        # Without a measurement the plan says where the system should be by now.
-        expected = memory.plan.x[0] if memory.plan is not None else np.zeros(self._ocp.n)
-        state = self._measured.copy() if usable else expected
+        now = self._believe(memory)
+        ahead = now
+        if now is not None and self._late and memory.applied is not None:
+            ahead = self._estimator.predict(now, memory.applied)
+        state = np.zeros(self._ocp.n) if ahead is None else self._estimator.state(ahead)
+        force = self._generator.still if ahead is None else self._estimator.force(ahead.mean)
         branch = self._generator.branch(state) if memory.branch is None else memory.branch
-        references = self._generator.over(memory.time, state, branch, memory.references)
-        solution = self._solver.solve(self._measured.copy(), references, memory.plan)
-        message = solution.stats.message
-        if not usable:
-            wrong = [
-                v.name for v, x in zip(self.variables, self._measured, strict=False) if not np.isfinite(x)
-            ]
-            message = f"measurement of {', '.join(wrong)} is not finite"
+        time = memory.time + (self._step if self._slow else 0.0)
+        references = self._generator.over(time, state, branch, memory.references, force)
+        unknown = np.full(self._ocp.n, np.nan)
+        solution = self._solver.solve(unknown if ahead is None else state, references, memory.plan)
+        message = "; ".join(text for text in (self._missing(), solution.stats.message) if text)
         if solution.status == SolveStatus.FAILED:
             u, following, action = self._fall_back(memory, references)
             message = f"{message}; {action}"
         else:
             u, following = solution.u[0], self._accept(memory, solution, references)
-        # A branch is decided by a measurement, and by nothing else.
-        decided = branch if usable else memory.branch
-        self._following = replace(following, branch=decided, references=references if usable else None)
-        self._write(u, references, solution, self._following, perf_counter() - begin)
-        if solution.status == SolveStatus.SOLVED:
+        u = np.clip(u, self._ocp.limits.u_min, self._ocp.limits.u_max)
+        # What is measured at the next tick belongs to that tick, or to this one where it arrives late.
+        belief = ahead if ahead is None or self._late else self._estimator.predict(ahead, u)
+        # A branch is decided by a state that is known, and by nothing else.
+        decided = memory.branch if ahead is None else branch
+        reported = references
+        if self._slow:
+            reported = memory.references or self._generator.over(memory.time, state, branch, None, force)
+        self._following = replace(
+            following,
+            branch=decided,
+            references=references if ahead is not None else None,
+            belief=belief,
+            applied=u,
+        )
+        applied = u if not self._slow else self._safe if memory.applied is None else memory.applied
+        at_tick = ahead if not self._slow else now
+        change = self._change(memory, state) if ahead is not None else 0.0
+        self._write(applied, reported, at_tick, solution, change, perf_counter() - begin)
+        if solution.status == SolveStatus.SOLVED and not self._missing():
             return Status.OK
         self.message = f"t = {memory.time:.9g} s: {message}"
         return Status.WARNING
 
+    def _believe(self, memory: _Memory) -> Belief | None:
+        """What the measurements tell of the state at their time; None before all have come once."""
+        y = self._measured.copy()
+        belief = None if memory.belief is None else self._estimator.update(memory.belief, y)
+        if belief is not None and belief.finite:
+            return belief
+        # At first, or where the model led the estimate astray.
+        if self._missing():
+            return None
+        return self._estimator.begin(y, self._starts)
+
+    def _missing(self) -> str:
+        """Which measurements are no numbers, in words."""
+        wrong = self._estimator.noise.measured & ~np.isfinite(self._measured)
+        names = [self.variables[k].name for k in np.flatnonzero(wrong)]
+        return f"measurement of {', '.join(names)} is not finite" if names else ""
+
+    def _change(self, memory: _Memory, state: NDArray[np.float64]) -> float:
+        """Most that the cost may grow by the state's being off its prediction.
+
+        With a cost xᵀPx: (x + w)ᵀP(x + w) − xᵀPx ≤ 2 √(xᵀPx wᵀPw) + wᵀPw.
+        """
+        if memory.plan is None or memory.P is None:
+            return 0.0
+        w = state - memory.plan.x[0]
+        off = max(0.0, float(w @ memory.P @ w))
+        return 2.0 * float(np.sqrt(max(0.0, memory.cost - memory.stage) * off)) + off
+
     def _accept(self, memory: _Memory, solution: Solution, references: References) -> _Memory:
         """What follows a solution."""
         plan = Plan(*self._ocp.shift(solution.x, solution.u, references.force))
-        stats = solution.stats
+        stats, targets = solution.stats, solution.targets
+        stage, P = 0.0, None
+        if targets is not None:
+            stage = self._ocp.weigh(
+                np.vstack([solution.x[0] - targets.x[0], np.zeros(self._ocp.n)]),
+                solution.u[:1] - targets.u[:1],
+                targets.P,
+            )
+            P = targets.P
         return replace(
-            memory, plan=plan, left=self._ocp.horizon - 1, cost=stats.cost, kkt=stats.kkt, slack=stats.slack
+            memory,
+            plan=plan,
+            left=self._ocp.horizon - 1,
+            cost=stats.cost,
+            stage=stage,
+            P=P,
+            kkt=stats.kkt,
+            slack=stats.slack,
         )
 
     def _fall_back(self, memory: _Memory, references: References) -> tuple[NDArray[np.float64], _Memory, str]:
@@ -227,20 +312,24 @@ class NmpcController(Component):
         self,
         u: NDArray[np.float64],
         references: References,
+        belief: Belief | None,
         solution: Solution,
-        following: _Memory,
+        change: float,
         seconds: float,
     ) -> None:
         """Fill the outputs, in the order of the variables."""
-        bounded = np.clip(u, self._ocp.limits.u_min, self._ocp.limits.u_max)
-        counts = [float(solution.status), float(solution.stats.iterations)]
+        following, estimator = self._following, self._estimator
+        assert following is not None
+        missing = np.count_nonzero(estimator.noise.measured & ~np.isfinite(self._measured))
         self._outputs = np.concatenate(
             [
-                bounded,
+                u,
                 references.quantity,
                 references.x[0],
-                [following.cost],
-                counts,
+                np.zeros(self._ocp.n) if belief is None else estimator.state(belief),
+                self._generator.still if belief is None else estimator.force(belief.mean),
+                [following.cost, following.stage, change],
+                [float(solution.status), float(missing), float(solution.stats.iterations)],
                 [following.kkt, seconds, float(following.fallbacks), following.slack],
             ]
         )

@@ -20,7 +20,7 @@ model error.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -35,6 +35,9 @@ from exlinn_fmi.errors import ModelError, nearest
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.scenario.control import Nmpc
 from exlinn_fmi.scenario.spec import Bounds
+
+HORIZON, KEEN, EASY = 30, 10.0, 1e-3
+"""Intervals, weight of the referenced states and of the inputs: the paper's, where nothing else tells."""
 
 BACK_OFF = 0.005
 """How far state bounds are moved inwards, as a share of their range."""
@@ -121,14 +124,16 @@ class Ocp:
         step: float,
         referenced: Sequence[int],
     ) -> None:
-        self.system, self.step, self.horizon = system, step, options.horizon
+        self.system, self.step, self.horizon = system, step, options.horizon or HORIZON
         self.n, self.m = len(system.state_names), len(system.input_names)
         if not self.m:
             raise ModelError("the model has no input that the controller could move")
         self.paper = options.cost == "paper"
         weights, chosen = options.weights, np.isin(np.arange(self.n), referenced).astype(float)
-        self.Q = np.diag(_numbers("weights.states", weights.states, system.state_names, chosen))
-        self.R = np.diag(_numbers("weights.inputs", weights.inputs, system.input_names, np.ones(self.m)))
+        q = KEEN if weights.states is None else weights.states
+        r = EASY if weights.inputs is None else weights.inputs
+        self.Q = np.diag(_numbers("weights.states", q, system.state_names, chosen))
+        self.R = np.diag(_numbers("weights.inputs", r, system.input_names, np.ones(self.m)))
         self.terminal = weights.terminal
         self.limits = _limits(options, system)
         largest = max(self.Q.max(), self.R.max())
@@ -271,19 +276,24 @@ def _numbers(
     """One number per name: a number times `shape`, or those that are named and else 0."""
     if not isinstance(given, Mapping):
         return given * shape
-    check_names(key, given, names)
+    check_names(key, given, names, key.rpartition(".")[2])
     return np.array([given.get(name, 0.0) for name in names])
 
 
-def check_names(key: str, given: Mapping[str, object], names: list[str]) -> None:
+def check_names(key: str, given: Iterable[str], names: list[str], kind: str) -> None:
     """Refuse names that the model does not have.
+
+    Args:
+        key: where they stand.
+        given: the names.
+        names: those that the model has.
+        kind: what these are, e.g. ``states``.
 
     Raises:
         ModelError: with the valid names.
     """
     for name in given:
         if name not in names:
-            kind = "inputs" if "inputs" in key or "input" in key else "states"
             raise ModelError(f"{key}: the model has no {name!r}; {nearest(name, names, kind)}")
 
 
@@ -304,7 +314,7 @@ def _limits(options: Nmpc, system: LagrangianSystem) -> Limits:
 def _bounds(
     key: str, given: Mapping[str, Bounds], names: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    check_names(key, given, names)
+    check_names(key, given, names, key)
     low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     for name, bounds in given.items():
         k = names.index(name)

@@ -69,12 +69,13 @@ class Stats:
 
 @dataclass(frozen=True)
 class Solution:
-    """A plan with its status; where that is FAILED the plan is not to be used."""
+    """A plan with its status and targets; where that is FAILED the plan is not to be used."""
 
     x: NDArray[np.float64]
     u: NDArray[np.float64]
     status: SolveStatus
     stats: Stats
+    targets: Targets | None = None
 
 
 class Solver(ABC):
@@ -129,7 +130,7 @@ class Solver(ABC):
         if not (np.isfinite(cost) and np.isfinite(slack) and np.isfinite(plan.u).all()):
             return failed(plan, Stats(stats.iterations, message="the plan is not finite", qp=stats.qp))
         full = Stats(stats.iterations, stats.kkt, cost, slack, stats.qp, stats.message)
-        return Solution(plan.x, plan.u, status, full)
+        return Solution(plan.x, plan.u, status, full, targets)
 
 
 def failed(plan: Plan, stats: Stats) -> Solution:

@@ -16,8 +16,21 @@ from exlinn_fmi.scenario.spec import Bounds
 if TYPE_CHECKING:
     import pandas as pd
 
-DIAGNOSTICS = ("reference", "cost", "solve_status", "iterations", "kkt", "solve_time", "fallbacks", "slack")
-"""Outputs of a controller that are not inputs of the plant."""
+DIAGNOSTICS = (
+    "reference",
+    "cost",
+    "stage_cost",
+    "cost_disturbance",
+    "solve_status",
+    "missing",
+    "iterations",
+    "kkt",
+    "solve_time",
+    "fallbacks",
+    "slack",
+)
+FAMILIES = ("reference_", "estimate_", "disturbance_")
+"""Outputs of a controller that are not inputs of the plant: their names, and how others begin."""
 BOUND_TOLERANCE = 1e-6
 """Share of the range between two bounds by which a value may be outside: the solver's tolerance."""
 
@@ -94,7 +107,7 @@ def control_loops(scenario: Scenario) -> list[Loop]:
         inputs: dict[str, str] = {}
         for source, target in connections:
             owner, variable = source.split(".", 1)
-            if owner == name and variable not in DIAGNOSTICS and not variable.startswith("reference_"):
+            if owner == name and variable not in DIAGNOSTICS and not variable.startswith(FAMILIES):
                 inputs.setdefault(variable, target)
         states = {
             target.split(".", 1)[1]: source

@@ -237,6 +237,12 @@ def control(survey: Survey) -> Iterator[Finding]:
                 outputs = [v.name for v in known.values() if v.causality == "output"]
                 inputs = outputs[: outputs.index(first)]
             yield from _controller((*at, "nmpc"), spec.nmpc, states, inputs)
+            if states is not None and known is not None:
+                heads = [target.split(".", 1) for _, target in survey.scenario.connection_list()]
+                connected = [variable for owner, variable in heads if owner == name]
+                yield from _estimator(
+                    (*at, "nmpc", "estimator"), spec.nmpc, list(states), list(known), connected
+                )
 
 
 def _learned(at: KeyPath, survey: Survey) -> Iterator[Finding]:
@@ -277,6 +283,24 @@ def _controller(
         if state is not None and reference.through is None and not same_unit(unit, state.unit):
             message = f"unit mismatch: trajectory [{unit}] → {state.name} [{state.unit}]"
             yield (*here, "trajectory"), f"{message}; give the kinematics as `through`"
+
+
+def _estimator(
+    at: KeyPath, nmpc: Nmpc, states: list[str], known: list[str], connected: list[str]
+) -> Iterator[Finding]:
+    """Names that the model does not have, and measurements that nothing brings."""
+    spec, prefix = nmpc.estimation, "disturbance_"
+    coordinates = [name.removeprefix(prefix) for name in known if name.startswith(prefix)]
+    noise = spec.noise if isinstance(spec.noise, dict) else {}
+    named = (("noise", noise, states), ("process", spec.process, states))
+    for key, given, names in (*named, ("disturbances", spec.disturbances or [], coordinates)):
+        yield from _unknown((*at, key), given, names, "states" if names is states else "coordinates")
+    for k, name in enumerate(spec.measured or []):
+        if name not in states:
+            hint = suggestion(name, states, "its states")
+            yield (*at, "measured", k), f"the model has no state {name!r}{hint}"
+        elif name not in connected:
+            yield (*at, "measured", k), f"nothing is connected to {name}; connect a sensor or leave it out"
 
 
 def _references(at: KeyPath, nmpc: Nmpc) -> Iterator[tuple[KeyPath, Reference]]:

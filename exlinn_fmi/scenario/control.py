@@ -51,13 +51,59 @@ Weight = Annotated[
 class Weights(Spec):
     """Weights of the cost: a number, or one by name (those not named weigh 0)."""
 
-    states: Weight = Field(10.0, description="Q, on x_ref − x; a number weighs the referenced state alone")
-    inputs: Weight = Field(
-        1e-3, description="R, on u, or on u − u_ref for tracking; a number weighs all inputs"
+    states: Weight | None = Field(
+        None,
+        description="Q, on x_ref − x; a number weighs the referenced states alone; if not given, from how "
+        "far the inputs move them within the model's slowest response; 10 with `cost: paper`",
+    )
+    inputs: Weight | None = Field(
+        None,
+        description="R, on u, or on u − u_ref for tracking; a number weighs all inputs; if not given, each "
+        "weighs one at half of its range; 1e-3 with `cost: paper`",
     )
     terminal: Annotated[
         Annotated[Literal["dare"], Tag("text")] | Annotated[NonNegative, Tag("a number")], Discriminator(form)
     ] = Field("dare", description="terminal cost: the Riccati solution at the reference, or a multiple of Q")
+
+
+Disturbances = Annotated[
+    Annotated[list[str], Tag("a list")] | Annotated[dict[str, Positive], Tag("a mapping")],
+    Discriminator(form),
+]
+EstimatorKind = Literal["auto", "none", "ekf", "mhe"]
+
+
+class Estimator(Spec):
+    """How states that are not measured, and disturbances, are found from those that are."""
+
+    type: EstimatorKind = Field(
+        "auto",
+        description="`ekf`: extended Kalman filter; `mhe`: moving horizon; `none`: states are as measured; "
+        "`auto`: `ekf` where a state of the model is not connected, else `none`",
+    )
+    measured: list[str] | None = Field(
+        None, min_length=1, description="states that are measured; those that are connected if not given"
+    )
+    noise: Weight | None = Field(
+        None,
+        description="standard deviation of the measurements by state, or as a share of each state's size; "
+        "a ten-thousandth of its size where not given",
+    )
+    process: dict[str, NonNegative] = Field(
+        default_factory=dict,
+        description="by state, what changes it beside the model: standard deviation over √s",
+    )
+    disturbances: Disturbances | None = Field(
+        None,
+        description="coordinates on which an unknown constant force is estimated, so that it leaves no "
+        "offset; by name with its change: standard deviation over √s. As many as the measurements tell "
+        "apart if not given; [] for none",
+    )
+    gain: Literal["updated", "steady"] = Field(
+        "updated", description="gain of `ekf`: of each sample, or that of the steady state at the reference"
+    )
+    window: int = Field(10, ge=1, le=1000, description="samples that `mhe` looks back")
+    iterations: int = Field(2, ge=1, le=100, description="Gauss–Newton steps of `mhe` at each sample")
 
 
 class Nmpc(Spec):
@@ -72,7 +118,12 @@ class Nmpc(Spec):
         Annotated[Reference, Tag("a mapping")] | Annotated[list[Reference], Tag("a list"), Len(1)],
         Discriminator(form),
     ] = Field(description="what to follow; a list for several coordinates")
-    horizon: int = Field(30, ge=1, le=10_000, description="N_p, number of intervals")
+    horizon: int | None = Field(
+        None,
+        ge=1,
+        le=10_000,
+        description="N_p, number of intervals; if not given, one and a half of the model's slowest response",
+    )
     cost: Literal["tracking", "paper"] = Field(
         "tracking",
         description="`tracking`: states and inputs against a reference trajectory that the model can follow; "
@@ -89,10 +140,23 @@ class Nmpc(Spec):
     iterations: int = Field(50, ge=1, description="most iterations of `sqp` and `ipopt`")
     tolerance: Positive = Field(1e-8, description="KKT tolerance of `sqp` and `ipopt`")
     substeps: int = Field(1, ge=1, le=100, description="RK4 steps in one interval")
+    estimator: Annotated[
+        Annotated[EstimatorKind, Tag("text")] | Annotated[Estimator, Tag("a mapping")], Discriminator(form)
+    ] = Field("auto", description="how states that are not measured, and disturbances, are found")
+    delay: Literal["none", "measurement", "computation"] = Field(
+        "none",
+        description="`measurement`: what is measured arrives a sample late; `computation`: the solve may "
+        "take a sample, its input is applied at the next one. Either is compensated by prediction",
+    )
     safe_input: dict[str, float] = Field(
         default_factory=dict,
         description="input to fall back to when there is no plan left, by name; 0 if not given",
     )
+
+    @property
+    def estimation(self) -> Estimator:
+        """The settings of the estimator."""
+        return Estimator(type=self.estimator) if isinstance(self.estimator, str) else self.estimator
 
     @property
     def references(self) -> dict[str, Reference]:

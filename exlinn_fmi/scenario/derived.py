@@ -68,8 +68,16 @@ def nmpc_variables(coordinates: tuple[Coordinate, ...], options: Nmpc) -> tuple[
             for name, reference in options.references.items()
         ),
         *(output(f"reference_{name}", unit, f"reference of {name}") for name, unit in states),
+        *(output(f"estimate_{name}", unit, f"{name} that the solve began with") for name, unit in states),
+        *(
+            output(f"disturbance_{c.name}", c.force_unit, f"estimated force on {c.name} beside the inputs")
+            for c in coordinates
+        ),
         output("cost", "1", "cost J of the plan"),
+        output("stage_cost", "1", "cost of the present state and input, the first term of J"),
+        output("cost_disturbance", "1", "most that the state's being off its prediction adds to J"),
         output("solve_status", "1", "0 solved, 1 iteration limit, 2 failed: fallback applied", "Enumeration"),
+        output("missing", "1", "measurements that are not a number", "Integer"),
         output("iterations", "1", "iterations of the solver", "Integer"),
         output("kkt", "1", "KKT residual"),
         output("solve_time", "s", "time that reference and solve took"),

@@ -11,7 +11,7 @@ from exlinn_fmi.components.base import Status
 from exlinn_fmi.control.solver import Plan, Solution, Solver, SolveStatus, Stats
 from exlinn_fmi.errors import DataError, InputError, ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate
-from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
+from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
 from exlinn_fmi.scenario.control import Linear, Reference, Weights
 from exlinn_fmi.scenario.signals import Table
 
@@ -52,8 +52,16 @@ def test_variables_are_states_then_inputs_then_how_they_came_about():
         "reference_alpha",
         "reference_alpha_dot",
         "reference_i",
+        "estimate_alpha",
+        "estimate_alpha_dot",
+        "estimate_i",
+        "disturbance_alpha",
+        "disturbance_Q",
         "cost",
+        "stage_cost",
+        "cost_disturbance",
         "solve_status",
+        "missing",
         "iterations",
         "kkt",
         "solve_time",
@@ -239,18 +247,22 @@ def test_the_safe_input_is_kept_within_bounds():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_measurement_that_is_not_finite_falls_back_and_spreads_nowhere(value):
+def test_a_measurement_that_is_not_finite_is_predicted_and_spreads_nowhere(value):
     made = controller()
-    measure(made, *START)
+    first, _ = measure(made, *START)
     made.step(0.0, STEP)
     outputs, status = measure(made, 1.5, value, 0.0)
     assert status == Status.WARNING
-    assert outputs["solve_status"] == 2
+    assert (outputs["solve_status"], outputs["missing"], outputs["fallbacks"]) == (0, 1, 0)
     assert np.isfinite(list(outputs.values())).all()
-    assert made.message.startswith("t = 0.01 s: measurement of alpha_dot is not finite; went on")
+    system = motor_cart()
+    expected = evaluate(system.rk4(), list(START), [first["v"]], system.parameter_values, [STEP])[0]
+    assert outputs["estimate_alpha_dot"] == pytest.approx(expected[1])
+    assert outputs["estimate_alpha"] == 1.5
+    assert made.message == "t = 0.01 s: measurement of alpha_dot is not finite"
     made.step(STEP, STEP)
     outputs, status = measure(made, 1.49, 0.1, 0.0)
-    assert (outputs["solve_status"], outputs["fallbacks"], status) == (0, 1, Status.OK)
+    assert (outputs["solve_status"], outputs["missing"], status) == (0, 0, Status.OK)
 
 
 def test_a_first_measurement_that_is_not_finite_decides_no_branch():
@@ -295,7 +307,7 @@ def test_good_settings_have_no_warnings():
 
 
 def test_a_horizon_that_cannot_see_the_slowest_response_is_told_with_numbers():
-    (warning,) = controller(step=1e-3).warnings
+    (warning,) = controller(step=1e-3, horizon=30).warnings
     # At rest the linearised motor has |λ|² = (r b + k²)/(l J) with J = 0.14 kg m².
     assert "30 × 0.001 s = 0.03 s" in warning
     assert f"({1 / np.sqrt(3.5 / 0.14):.3g} s)" in warning

@@ -315,6 +315,46 @@ def test_a_controller_fits_its_model(tmp_path, old, new, path, message):
     assert message in found.message
 
 
+ESTIMATOR = "      safe_input: {v: 0}\n      estimator: {type: ekf, "
+
+
+@pytest.mark.parametrize(
+    ("given", "path", "message"),
+    [
+        ("measured: [alpha, w]", "measured[1]", "the model has no state 'w'"),
+        ("measured: [alpha, i]", "measured[1]", "nothing is connected to i; connect a sensor"),
+        ("noise: {w: 1}", "noise.w", "the model has no state 'w'"),
+        ("process: {w: 1}", "process.w", "the model has no state 'w'"),
+        ("disturbances: [i]", "disturbances.i", "the model has no coordinate 'i'; its coordinates: alpha, Q"),
+        ("disturbances: {Q: 0}", "disturbances.Q", "expected > 0, found 0"),
+        ("gain: best", "gain", "expected updated or steady, found text 'best'"),
+    ],
+)  # fmt: skip
+def test_an_estimator_fits_its_model_and_what_is_connected(tmp_path, given, path, message):
+    text = SCENARIO.replace("  plant.i: ctl.i\n", "")
+    found = problem(tmp_path, "      safe_input: {v: 0}\n", f"{ESTIMATOR}{given}}}\n", text)
+    assert found.path == f"components.ctl.nmpc.estimator.{path}"
+    assert message in found.message
+
+
+@pytest.mark.parametrize("given", ["mhe", "{type: ekf, gain: steady, disturbances: []}"])
+def test_an_estimator_is_a_word_or_a_mapping(tmp_path, given):
+    text = SCENARIO.replace("      safe_input", f"      estimator: {given}\n      safe_input")
+    assert problems(tmp_path, text.replace("  plant.i: ctl.i\n", "")) == ()
+
+
+def test_several_references_are_a_list_each_with_its_place(tmp_path):
+    at, end = SCENARIO.index("        coordinate: alpha\n"), SCENARIO.index("  load:\n")
+    several = (
+        "        - {coordinate: alpha, trajectory: {signal: constant, value: 1}}\n"
+        "        - {coordinate: w, trajectory: {signal: constant, value: 1}}\n"
+    )
+    found = problems(tmp_path, SCENARIO[:at] + several + SCENARIO[end:])
+    assert [(p.path, p.message.split(";")[0]) for p in found] == [
+        ("components.ctl.nmpc.reference[1].coordinate", "the model has no state 'w'")
+    ]
+
+
 def test_a_learned_model_needs_a_learn_section(tmp_path):
     text = SCENARIO[: SCENARIO.index("learn:\n")] + SCENARIO[SCENARIO.index("simulate:\n") :]
     found = problems(tmp_path, text.replace("  load:", "  twin: {model: learned}\n  load:"))
