@@ -93,6 +93,11 @@ class Plan:
 
     Attributes:
         signals: the time, and the value of every variable that is passed on or recorded.
+        ahead: with Gauss–Seidel, the values after a step that later steps of the same tick take.
+        visits: the exchanges of a communication point in order, each with its component's own step in ticks.
+        advances: the steps in order.
+        hold_to, hold_from: places in `signals` of delayed values, and of what they are next.
+        ticks: number of the last tick.
         columns: where time and recorded variables are in `signals`.
         warnings: by component name.
     """
@@ -109,13 +114,13 @@ class Plan:
     ) -> None:
         self.graph, self.components = graph, tuple(components)
         self.warnings: dict[str, Warned] = {}
-        self._ticks = ticks
+        self.ticks = ticks
         self._lay_out(recorded)
-        self._visits = [
+        self.visits = [
             (every[v.component], self._exchange_of(v.component, self.signals, given, taken))
             for v, given, taken in self._pieces
         ]
-        self._advances = self._plan_advances(every, step, gauss_seidel)
+        self.advances = self._plan_advances(every, step, gauss_seidel)
 
     # ── layout ───────────────────────────────────────────────────────────────────────────────────────────
 
@@ -153,8 +158,8 @@ class Plan:
         self._source = {i: (holds if (o, i) in graph.delayed else places)[o] for o, i in graph.connections}
         self._constants = [self._exchange_of(_number(p), self.signals, {}, p) for p in constants]
         self._before_first = [self._exchange_of(_number(p), self.signals, {}, p) for p in held]
-        self._hold_to = _indices(holds.values())
-        self._hold_from = _indices(places[port] for port in holds)
+        self.hold_to = _indices(holds.values())
+        self.hold_from = _indices(places[port] for port in holds)
 
     def _exchange_of(
         self,
@@ -198,14 +203,14 @@ class Plan:
         }
         ports = [*sorted(set(fresh.values())), *sorted(fresh)]
         place = {port: k for k, port in enumerate(ports)}
-        self._ahead: Values = np.zeros(len(ports))
+        self.ahead: Values = np.zeros(len(ports))
         source = {i: place[o] for i, o in fresh.items()}
         advances = []
         for n in numbers:
             given = {p: place[p] for p in sorted(fresh) if p[0] == n}
             taken = {p: place[p] for p in sorted(set(fresh.values())) if p[0] == n}
-            before = self._exchange_of(n, self._ahead, given, {}, source) if given else None
-            after = self._exchange_of(n, self._ahead, {}, taken, source) if taken else None
+            before = self._exchange_of(n, self.ahead, given, {}, source) if given else None
+            after = self._exchange_of(n, self.ahead, {}, taken, source) if taken else None
             advances.append(Advance(n, every[n], every[n] * step, self.components[n].step, before, after))
         return advances
 
@@ -229,21 +234,21 @@ class Plan:
             except (InputError, RunError):
                 raise
             except Exception as error:
-                raise self._wrapped(number, error, start) from error
+                raise self.wrapped(number, error, start) from error
             if status:
-                self._judge(number, status, "initialisation", start)
+                self.judge(number, status, "initialisation", start)
         for exchange in self._before_first:
-            self._exchange(exchange, self.signals, start)
+            self.exchange(exchange, self.signals, start)
         self.propagate(0, start)
         for number, component in enumerate(self.components):
             try:
                 status = component.exit_initialization()
             except Exception as error:
-                raise self._wrapped(number, error, start) from error
+                raise self.wrapped(number, error, start) from error
             if status:
-                self._judge(number, status, "the end of initialisation", start)
+                self.judge(number, status, "the end of initialisation", start)
         for exchange in self._constants:
-            self._exchange(exchange, self.signals, start)
+            self.exchange(exchange, self.signals, start)
 
     def propagate(self, k: int, t: float) -> None:
         """Pass values through all connections of the components due at tick k.
@@ -257,11 +262,11 @@ class Plan:
         """
         signals = self.signals
         signals[0] = t
-        for every, exchange in self._visits:
+        for every, exchange in self.visits:
             if not k % every:
-                self._exchange(exchange, signals, t)
-        if self._hold_to.size:
-            signals[self._hold_to] = signals[self._hold_from]
+                self.exchange(exchange, signals, t)
+        if self.hold_to.size:
+            signals[self.hold_to] = signals[self.hold_from]
 
     def advance(self, k: int, t: float) -> None:
         """Step the components due at tick k, each over its own step.
@@ -273,42 +278,51 @@ class Plan:
         Raises:
             RunError: a component failed or gave a value that is not finite.
         """
-        for a in self._advances:
-            # A last own step that leads beyond the end is left out: nobody would read what comes of it.
-            if k % a.every or k + a.every > self._ticks:
-                continue
-            if a.before is not None:
-                self._exchange(a.before, self._ahead, t)
-            try:
-                status = a.step(t, a.h)
-            except Exception as error:
-                raise self._wrapped(a.component, error, t) from error
-            if status:
-                self._judge(a.component, status, "the step", t)
-            if a.after is not None:
-                self._exchange(a.after, self._ahead, t + a.h)
+        for a in self.advances:
+            if not k % a.every:
+                self.step(a, k, t)
 
-    def _exchange(self, x: Exchange, vector: Values, t: float) -> None:
+    def step(self, a: Advance, k: int, t: float) -> None:
+        """Step one component that is due at tick k.
+
+        Raises:
+            RunError: it failed or gave a value that is not finite.
+        """
+        # A last own step that leads beyond the end is left out: nobody would read what comes of it.
+        if k + a.every > self.ticks:
+            return
+        if a.before is not None:
+            self.exchange(a.before, self.ahead, t)
+        try:
+            status = a.step(t, a.h)
+        except Exception as error:
+            raise self.wrapped(a.component, error, t) from error
+        if status:
+            self.judge(a.component, status, "the step", t)
+        if a.after is not None:
+            self.exchange(a.after, self.ahead, t + a.h)
+
+    def exchange(self, x: Exchange, vector: Values, t: float) -> None:
         """Do an exchange and check what comes of it."""
         try:
             if x.inputs is not None:
                 x.given[:] = vector[x.sources]
                 if status := x.set(x.inputs, x.given):
-                    self._judge(x.component, status, "setting inputs", t)
+                    self.judge(x.component, status, "setting inputs", t)
             if x.outputs is not None:
                 if status := x.get(x.outputs, x.taken):
-                    self._judge(x.component, status, "reading outputs", t)
+                    self.judge(x.component, status, "reading outputs", t)
                 # Sum of squares: several times faster than isfinite, and finite only if all are.
                 if not x.taken.dot(x.taken) < math.inf:
-                    self._check_finite(x, t)
+                    self.check_finite(x, t)
         except RunError:
             raise
         except Exception as error:
-            raise self._wrapped(x.component, error, t) from error
+            raise self.wrapped(x.component, error, t) from error
 
     # ── failure ──────────────────────────────────────────────────────────────────────────────────────────
 
-    def _check_finite(self, x: Exchange, t: float) -> None:
+    def check_finite(self, x: Exchange, t: float) -> None:
         """Name the first value that is not finite; the square of a large one may overflow without harm.
 
         Raises:
@@ -325,7 +339,7 @@ class Plan:
         warned = self.warnings.setdefault(self.graph.names[number], Warned(0, text))
         warned.count += 1
 
-    def _judge(self, number: int, status: int, what: str, t: float) -> None:
+    def judge(self, number: int, status: int, what: str, t: float) -> None:
         """Count a warning; stop on anything worse.
 
         Raises:
@@ -338,7 +352,7 @@ class Plan:
         word = status.name if isinstance(status, Status) else repr(status)
         raise ComponentError(name, f"{what} ended with status {word}: {said}", time=t)
 
-    def _wrapped(self, number: int, error: Exception, t: float) -> RunError:
+    def wrapped(self, number: int, error: Exception, t: float) -> RunError:
         """An exception out of a component's code as an error that names the component and the place."""
         if isinstance(error, RunError):
             return error

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from exlinn_fmi.components.base import Component
+from exlinn_fmi.components.base import Component, Indices, Values
 from exlinn_fmi.cosim.order import Port
 from exlinn_fmi.errors import InputError, nearest
 
@@ -66,23 +66,27 @@ def _expression(pattern: str) -> str:
 
 
 class Recorder:
-    """A table with a row for each communication point, allocated before the run begins.
+    """A table with a row for every so many communication points, allocated before the run begins.
 
     Args:
         names: names of the columns, the first is the time.
         units: units by name.
-        rows: number of rows when the run is complete.
+        ticks: number of the last communication point.
+        every: a row is recorded at each tick that is a multiple of it.
 
     Attributes:
         table: (rows, columns), filled from the top by whoever steps.
         rows: how many are filled.
+        base: number of the row that the table begins with.
 
     Raises:
         InputError: so many rows do not fit into memory.
     """
 
-    def __init__(self, names: Sequence[str], units: Mapping[str, str], rows: int) -> None:
-        self.names, self.units, self.rows = list(names), dict(units), 0
+    def __init__(self, names: Sequence[str], units: Mapping[str, str], ticks: int, every: int = 1) -> None:
+        self.names, self.units, self.every = list(names), dict(units), every
+        self.rows = self.base = 0
+        rows = ticks // every + 1
         try:
             self.table: NDArray[np.float64] = np.empty((rows, len(names)))
         except (MemoryError, ValueError) as error:
@@ -90,6 +94,13 @@ class Recorder:
             raise InputError(
                 f"{size} do not fit into memory; record fewer variables, take a longer step or stop earlier"
             ) from error
+
+    def record(self, tick: int, signals: Values, columns: Indices) -> None:
+        """Record the row of a tick, if it has one."""
+        if not tick % self.every:
+            row = tick // self.every
+            self.table[row - self.base] = signals[columns]
+            self.rows = row + 1
 
     def frame(self) -> pd.DataFrame:
         """The filled rows as a frame."""

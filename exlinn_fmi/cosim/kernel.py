@@ -1,0 +1,310 @@
+"""The loop of compiled stepping: reads a program of C calls and moves of values, and does it tick by tick.
+
+Importing this imports numba and costs a fraction of a second; the first run on a machine compiles the loop,
+which takes seconds, and keeps it in numba's cache. The loop is the same for all graphs: what differs is the
+program, a table of numbers that `compiled.py` makes.
+
+Nothing here can run as plain Python (it calls C functions and memory by address), so coverage does not see
+it; the tests hold it to the plain stepping, bit by bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from inspect import unwrap
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
+
+# Acts of a program, in column CODE.
+SET, GET, STEP, TABLE, MOVE, TICK, ROW, PYTHON = range(8)
+
+# Columns of a program. An act is done at every EVERY-th tick, unless SPAN ticks from there lead beyond the
+# end; WHO is a component's number or −1. SET, GET: function, handle, references, count and values are the
+# arguments; moves from FIRST to LAST are done before SET and after GET; CHECKED values from CHECK on must be
+# finite after GET.
+CODE, EVERY, SPAN, WHO, FUNCTION, HANDLE = range(6)
+REFERENCES, COUNT, VALUES, COUNTED, FIRST, LAST, CHECK, CHECKED = range(6, 14)
+FLAG, EVENT, END, EARLY, REACHED = range(6, 11)  # STEP; EVENT is 0 in FMI 2
+WIDTH = 14
+
+# What the loop knows of itself, and what the caller reads and writes.
+AT_TICK, AT, UNTIL, FINAL, BASE, RESULT, CLOCK = range(7)
+STATES = 7
+
+# Why the loop returned.
+DONE, CALL, STATUS, REFUSED, INFINITE = range(5)
+
+# Kinds of moves between memory cells: as they are, from float64 to a type, from a type to float64.
+FROM = 16
+TYPES = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "truth1", "truth4")
+F8, F4, I1, U1, I2, U2, I4, U4, I8, U8, B1, B4 = range(12)
+
+
+# ── C calls and memory, by address ───────────────────────────────────────────────────────────────────────
+
+_INT, _DOUBLE = ir.IntType(64), ir.DoubleType()
+
+
+def _c_function(arguments: str) -> Any:  # pragma: no cover - runs while numba compiles
+    """Type and code of a call of ``int f(…)``; pointers, sizes and flags (i) travel in whole registers."""
+    kinds = {"i": (types.int64, _INT), "d": (types.float64, _DOUBLE)}
+    signature = types.int32(types.int64, *(kinds[a][0] for a in arguments))
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        function = ir.FunctionType(ir.IntType(32), [kinds[a][1] for a in arguments])
+        return builder.call(builder.inttoptr(values[0], function.as_pointer()), values[1:])
+
+    return signature, code
+
+
+def _load_as(kind: Any) -> Any:  # pragma: no cover - runs while numba compiles
+    """Type and code of reading a value at an address."""
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.load(
+            builder.inttoptr(values[0], context.get_data_type(kind).as_pointer()), align=kind.bitwidth // 8
+        )
+
+    return kind(types.int64), code
+
+
+def _store_as(kind: Any) -> Any:  # pragma: no cover - runs while numba compiles
+    """Type and code of writing a value to an address."""
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        builder.store(values[1], builder.inttoptr(values[0], context.get_data_type(kind).as_pointer()))
+        return context.get_dummy_value()
+
+    return types.void(types.int64, kind), code
+
+
+_access2 = intrinsic(lambda context, f, handle, references, count, values: _c_function("iiii"))
+_access3 = intrinsic(lambda context, f, handle, references, count, values, again: _c_function("iiiii"))
+_step2 = intrinsic(lambda context, f, handle, t, h, flag: _c_function("iddi"))
+_step3 = intrinsic(lambda context, f, handle, t, h, flag, event, end, early, reached: _c_function("iddiiiii"))
+_clock = intrinsic(lambda context, f, which, out: _c_function("ii"))
+
+_get_f8 = intrinsic(lambda context, at: _load_as(types.float64))
+_get_f4 = intrinsic(lambda context, at: _load_as(types.float32))
+_get_i1 = intrinsic(lambda context, at: _load_as(types.int8))
+_get_u1 = intrinsic(lambda context, at: _load_as(types.uint8))
+_get_i2 = intrinsic(lambda context, at: _load_as(types.int16))
+_get_u2 = intrinsic(lambda context, at: _load_as(types.uint16))
+_get_i4 = intrinsic(lambda context, at: _load_as(types.int32))
+_get_u4 = intrinsic(lambda context, at: _load_as(types.uint32))
+_get_i8 = intrinsic(lambda context, at: _load_as(types.int64))
+_get_u8 = intrinsic(lambda context, at: _load_as(types.uint64))
+_put_f8 = intrinsic(lambda context, at, value: _store_as(types.float64))
+_put_f4 = intrinsic(lambda context, at, value: _store_as(types.float32))
+_put_1 = intrinsic(lambda context, at, value: _store_as(types.int8))
+_put_2 = intrinsic(lambda context, at, value: _store_as(types.int16))
+_put_4 = intrinsic(lambda context, at, value: _store_as(types.int32))
+_put_8 = intrinsic(lambda context, at, value: _store_as(types.int64))
+_put_u8 = intrinsic(lambda context, at, value: _store_as(types.uint64))
+
+
+def _compile(function: Callable[..., Any], **options: bool) -> Any:
+    """A function as numba compiles it, bare of wrappers that check types while tests run."""
+    return njit(unwrap(function), **options)
+
+
+# ── moves of values ──────────────────────────────────────────────────────────────────────────────────────
+
+# Numbers that a type holds, by kind: from LOWEST on, below BEYOND.
+LOWEST = (0.0, 0.0, -(2.0**7), 0.0, -(2.0**15), 0.0, -(2.0**31), 0.0, -(2.0**63), 0.0, 0.0, 0.0)
+BEYOND = (0.0, 0.0, 2.0**7, 2.0**8, 2.0**15, 2.0**16, 2.0**31, 2.0**32, 2.0**63, 2.0**64, 2.0, 2.0)
+
+
+def _load(kind: int, at: int) -> float:  # pragma: no cover - compiled
+    """The value at an address as float64."""
+    if kind == F4:
+        return float(_get_f4(at))
+    if kind == I1:
+        return float(_get_i1(at))
+    if kind in (U1, B1):
+        return float(_get_u1(at))
+    if kind == I2:
+        return float(_get_i2(at))
+    if kind == U2:
+        return float(_get_u2(at))
+    if kind in (I4, B4):
+        return float(_get_i4(at))
+    if kind == U4:
+        return float(_get_u4(at))
+    if kind == I8:
+        return float(_get_i8(at))
+    if kind == U8:
+        return float(_get_u8(at))
+    return float(_get_f8(at))
+
+
+def _store(kind: int, value: float, at: int) -> bool:  # pragma: no cover - compiled
+    """Put a value into a type; False where it cannot hold it."""
+    if kind == F8:
+        _put_f8(at, value)
+        return True
+    if kind == F4:
+        _put_f4(at, value)
+        return True
+    if not (LOWEST[kind] <= value < BEYOND[kind] and np.floor(value) == value):
+        return False
+    if kind in (I1, U1, B1):
+        _put_1(at, int(value))
+    elif kind in (I2, U2):
+        _put_2(at, int(value))
+    elif kind in (I4, U4, B4):
+        _put_4(at, int(value))
+    elif kind == I8:
+        _put_8(at, int(value))
+    else:
+        _put_u8(at, np.uint64(value))
+    return True
+
+
+_load, _store = _compile(_load), _compile(_store)
+
+
+def _move(moves: Any, first: int, last: int) -> bool:  # pragma: no cover - compiled
+    """Carry values from cell to cell; False at the first that its type cannot hold."""
+    for m in range(first, last):
+        kind, source, target = moves[m, 0], moves[m, 1], moves[m, 2]
+        if kind == F8:
+            _put_f8(target, _get_f8(source))
+        elif kind >= FROM:
+            _put_f8(target, _load(kind - FROM, source))
+        elif not _store(kind, _get_f8(source), target):
+            return False
+    return True
+
+
+def _finite(first: int, count: int) -> bool:  # pragma: no cover - compiled
+    """Whether all values from an address on are finite."""
+    for m in range(count):
+        value = _get_f8(first + 8 * m)
+        if value - value != 0.0:
+            return False
+    return True
+
+
+_move, _finite = _compile(_move), _compile(_finite)
+
+# ── the loop ─────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _run(
+    program: Any,
+    moves: Any,
+    columns: Any,
+    signals: Any,
+    table: Any,
+    own_steps: Any,
+    span: Any,
+    seconds: Any,
+    state: Any,
+) -> int:  # pragma: no cover - compiled
+    """Do a program from `state[AT]` in tick `state[AT_TICK]` until tick `state[UNTIL]`, or until told.
+
+    Args:
+        program: (acts, WIDTH) int64, see the columns above.
+        moves: (moves, 3) int64: kind, address read, address written.
+        columns: where the columns of a row are in `signals`.
+        signals: the signal vector; its first entry is the time.
+        table: rows, from tick `state[BASE]` on.
+        own_steps: step [s] by act.
+        span: start time and step [s].
+        seconds: time spent by component number, where `state[CLOCK]` is the address of clock_gettime.
+        state: see above.
+
+    Returns:
+        Why it ended. Unless DONE, the act at `state[AT]` in tick `state[AT_TICK]` needs the caller.
+    """
+    tick, at, until, final, clock = state[AT_TICK], state[AT], state[UNTIL], state[FINAL], state[CLOCK]
+    now = np.zeros(2, np.int64)
+    t = span[0] + tick * span[1]
+    acts = len(program)
+    reason, result = DONE, 0
+    if clock:
+        _clock(clock, 1, now.ctypes.data)
+    before = 1e9 * now[0] + now[1]
+    while tick < until or at > 0:
+        while at < acts:
+            act = program[at]
+            code = act[CODE]
+            if (act[EVERY] != 1 and tick % act[EVERY]) or tick + act[SPAN] > final:
+                at += 1
+                continue
+            if code == SET:
+                if not _move(moves, act[FIRST], act[LAST]):
+                    reason = REFUSED
+                elif act[COUNTED]:
+                    result = _access3(
+                        act[FUNCTION], act[HANDLE], act[REFERENCES], act[COUNT], act[VALUES], act[COUNT]
+                    )
+                else:
+                    result = _access2(act[FUNCTION], act[HANDLE], act[REFERENCES], act[COUNT], act[VALUES])
+            elif code == GET:
+                if act[COUNTED]:
+                    result = _access3(
+                        act[FUNCTION], act[HANDLE], act[REFERENCES], act[COUNT], act[VALUES], act[COUNT]
+                    )
+                else:
+                    result = _access2(act[FUNCTION], act[HANDLE], act[REFERENCES], act[COUNT], act[VALUES])
+                _move(moves, act[FIRST], act[LAST])
+                if not result and not _finite(act[CHECK], act[CHECKED]):
+                    reason = INFINITE
+            elif code == STEP:
+                if act[EVENT]:
+                    result = _step3(
+                        act[FUNCTION],
+                        act[HANDLE],
+                        t,
+                        own_steps[at],
+                        act[FLAG],
+                        act[EVENT],
+                        act[END],
+                        act[EARLY],
+                        act[REACHED],
+                    )
+                    if not result and (_get_u1(act[END]) or _get_u1(act[EARLY])):
+                        reason = STATUS
+                else:
+                    result = _step2(act[FUNCTION], act[HANDLE], t, own_steps[at], act[FLAG])
+            elif code == MOVE:
+                _move(moves, act[FIRST], act[LAST])
+            elif code == TABLE:
+                for m in range(act[COUNT]):
+                    _put_f8(act[VALUES] + 8 * m, _get_f8(act[REFERENCES] + 8 * m))
+                act[REFERENCES] += 8 * act[COUNT]
+                if not _finite(act[VALUES], act[COUNT]):
+                    reason = INFINITE
+            elif code == TICK:
+                tick += 1
+                t = span[0] + tick * span[1]
+                signals[0] = t
+            elif code == ROW:
+                row = tick // act[EVERY] - state[BASE]
+                for m in range(len(columns)):
+                    table[row, m] = signals[columns[m]]
+            else:
+                reason = CALL
+            if clock:
+                _clock(clock, 1, now.ctypes.data)
+                after = 1e9 * now[0] + now[1]
+                if act[WHO] >= 0 and reason != CALL:
+                    seconds[act[WHO]] += 1e-9 * (after - before)
+                before = after
+            if result or reason:
+                state[AT_TICK], state[AT], state[RESULT] = tick, at, result
+                return reason or STATUS
+            at += 1
+        at = 0
+    state[AT_TICK], state[AT] = tick, at
+    return DONE
+
+
+run = _compile(_run, cache=True, nogil=True)
+"""`_run`, compiled."""

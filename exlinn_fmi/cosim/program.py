@@ -1,0 +1,212 @@
+"""A plan as a program for the compiled loop: a table of C calls and moves of values, addresses and all.
+
+See `kernel.py` for what the columns mean, and `compiled.py` for who runs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from exlinn_fmi.components.base import Values
+from exlinn_fmi.components.native import Native, NativeAccess
+from exlinn_fmi.cosim import kernel as k
+from exlinn_fmi.cosim.plan import Advance, Exchange, Plan
+
+Columns = dict[int, int]
+
+
+@dataclass(frozen=True)
+class Act:
+    """What a line of the program is part of, for when the loop comes back with it.
+
+    Args:
+        what: it does, in words.
+        name: of its C function.
+        native: the C functions that it is one of.
+        exchange: it is part of.
+        vector: that the exchange reads.
+        call: what to do from Python in its place, given tick and time [s].
+        more: calls that follow it and belong to the same set or get.
+    """
+
+    what: str = ""
+    name: str = ""
+    native: Native | None = None
+    exchange: Exchange | None = None
+    vector: Values | None = None
+    call: Callable[[int, float], None] | None = None
+    more: int = 0
+
+
+@dataclass(frozen=True)
+class Source:
+    """A component that depends on time alone: the line that reads its table, and what it does in a plan."""
+
+    line: int
+    exchange: Exchange
+    advance: Advance
+
+
+class Program:
+    """The acts of a tick, from the steps that begin at it to the row of the next one.
+
+    Args:
+        plan: initialised.
+        every: a row is recorded at every so many ticks.
+        t: present time [s].
+
+    Attributes:
+        table: (acts, `kernel.WIDTH`), see `kernel.py`.
+        moves: (moves, 3): kind, address read, address written.
+        own_steps: step [s] by act.
+        acts: what the lines are part of.
+        tick: the line with which the next tick begins.
+        sources: components whose values are tabulated.
+    """
+
+    def __init__(self, plan: Plan, every: int, t: float) -> None:
+        self._plan, self._now = plan, np.array([t])
+        self._natives = [component.native() for component in plan.components]
+        self._lines: list[Columns] = []
+        self._moves: list[tuple[int, int, int]] = []
+        self._own: list[float] = []
+        self._kept: list[Any] = []
+        self.acts: list[Act] = []
+        self.sources: list[Source] = []
+        tabulated = {x.component for _, x in plan.visits if self._is_source(x)}
+        steps = {a.component: a for a in plan.advances}
+        for a in plan.advances:
+            if a.component not in tabulated:
+                self._add_step(a)
+        self.tick = self._add(k.TICK)
+        for own, x in plan.visits:
+            if x.component in tabulated:
+                reading = {k.EVERY: own, k.COUNT: len(x.taken), k.VALUES: _address(x.taken)}
+                line = self._add(k.TABLE, reading, Act(exchange=x))
+                self.sources.append(Source(line, x, steps[x.component]))
+            else:
+                self._add_exchange(x, plan.signals, {k.EVERY: own})
+        base = plan.signals.ctypes.data
+        held = zip(plan.hold_from, plan.hold_to, strict=True)
+        first = self._add_moves((k.F8, base + 8 * int(a), base + 8 * int(b)) for a, b in held)
+        self._add(k.MOVE, {k.FIRST: first, k.LAST: len(self._moves)})
+        self._add(k.ROW, {k.EVERY: every})
+        self.table = np.zeros((len(self._lines), k.WIDTH), dtype=np.int64)
+        self.table[:, k.EVERY], self.table[:, k.WHO] = 1, -1
+        for row, columns in zip(self.table, self._lines, strict=True):
+            row[list(columns)] = list(columns.values())
+        self.moves = np.array(self._moves or [(0, 0, 0)], dtype=np.int64)
+        self.own_steps = np.array(self._own)
+
+    def _is_source(self, x: Exchange) -> bool:
+        """Whether an exchange reads what depends on time alone."""
+        if x.inputs is not None or x.outputs is None:
+            return False
+        return self._plan.components[x.component].outputs_over(x.outputs, self._now) is not None
+
+    def _add(self, code: int, columns: Columns | None = None, act: Act | None = None, h: float = 0.0) -> int:
+        """Add a line; gives its number."""
+        self._lines.append({k.CODE: code, **(columns or {})})
+        self.acts.append(act or Act())
+        self._own.append(h)
+        return len(self._lines) - 1
+
+    def _add_moves(self, moves: Any) -> int:
+        """Add moves; gives the number of the first."""
+        first = len(self._moves)
+        self._moves += moves
+        return first
+
+    def _add_step(self, a: Advance) -> None:
+        """A step, with its exchanges before and after in Gauss–Seidel."""
+        native, due = self._natives[a.component], {k.EVERY: a.every, k.SPAN: a.every}
+        if native is None:
+            self._add(k.PYTHON, due, Act(call=lambda tick, t: self._plan.step(a, tick, t)))
+            return
+        if a.before is not None:
+            self._add_exchange(a.before, self._plan.ahead, due)
+        step = native.step
+        columns = {
+            **due,
+            k.WHO: a.component,
+            k.FUNCTION: step.function,
+            k.HANDLE: step.handle,
+            k.FLAG: step.flag,
+        }
+        columns |= dict(zip((k.EVENT, k.END, k.EARLY, k.REACHED), step.pointers, strict=False))
+        self._add(k.STEP, columns, Act("the step", "DoStep", native), a.h)
+        if a.after is not None:
+            self._add_exchange(a.after, self._plan.ahead, due)
+
+    def _add_exchange(self, x: Exchange, vector: Values, due: Columns) -> None:
+        """An exchange: the calls that set, then those that get."""
+        native, who = self._natives[x.component], {**due, k.WHO: x.component}
+        if native is None:
+            self._add(k.PYTHON, due, Act(call=lambda tick, t: self._plan.exchange(x, vector, t)))
+            return
+        if x.inputs is not None:
+            sources = vector.ctypes.data + 8 * x.sources
+            given = zip(sources.tolist(), _addresses(x.given), strict=True)
+            first = self._add_moves((k.F8, a, b) for a, b in given)
+            calls = native.access("Set", x.inputs)
+            for n, call in enumerate(calls, 1):
+                values, kind = self._buffer(call, x.given)
+                if kind is not None:
+                    cells = zip(_addresses(x.given, call.positions), _addresses(values), strict=True)
+                    self._add_moves((kind, a, b) for a, b in cells)
+                columns = {**who, **_arguments(call, values), k.FIRST: first, k.LAST: len(self._moves)}
+                act = Act("setting inputs", call.name, native, x, vector, more=len(calls) - n)
+                self._add(k.SET, columns, act)
+                first = len(self._moves)
+        if x.outputs is not None:
+            calls = native.access("Get", x.outputs)
+            for n, call in enumerate(calls, 1):
+                values, kind = self._buffer(call, x.taken)
+                first = len(self._moves)
+                if kind is not None:
+                    cells = zip(_addresses(values), _addresses(x.taken, call.positions), strict=True)
+                    self._add_moves((kind + k.FROM, a, b) for a, b in cells)
+                columns = {**who, **_arguments(call, values), k.FIRST: first, k.LAST: len(self._moves)}
+                if n == len(calls):
+                    columns |= {k.CHECK: _address(x.taken), k.CHECKED: len(x.taken)}
+                act = Act("reading outputs", call.name, native, x, vector, more=len(calls) - n)
+                self._add(k.GET, columns, act)
+
+    def _buffer(self, call: NativeAccess, piece: Values) -> tuple[NDArray[Any], int | None]:
+        """Values of a call: the piece of the vector itself, or else a buffer and the kind of its elements."""
+        self._kept.append(call.references)
+        whole = np.array_equal(call.positions, np.arange(len(piece)))
+        if whole and call.dtype == np.float64:
+            return piece, None
+        buffer = np.zeros(len(call.positions), dtype=call.dtype)
+        self._kept.append(buffer)
+        if call.boolean:
+            return buffer, k.B1 if buffer.itemsize == 1 else k.B4
+        return buffer, k.TYPES.index(f"{buffer.dtype.kind}{buffer.itemsize}")
+
+
+def _arguments(call: NativeAccess, values: NDArray[Any]) -> Columns:
+    return {
+        k.FUNCTION: call.function,
+        k.HANDLE: call.handle,
+        k.REFERENCES: call.references.ctypes.data,
+        k.COUNT: len(call.references),
+        k.VALUES: _address(values),
+        k.COUNTED: call.counted,
+    }
+
+
+def _address(values: NDArray[Any]) -> int:
+    return int(values.ctypes.data)
+
+
+def _addresses(values: NDArray[Any], positions: Sequence[int] | NDArray[np.intp] | None = None) -> list[int]:
+    """Where the elements of a contiguous array lie."""
+    numbers = np.arange(len(values)) if positions is None else np.asarray(positions)
+    found: list[int] = (values.ctypes.data + values.itemsize * numbers).tolist()
+    return found
