@@ -109,7 +109,7 @@ _put_u8 = intrinsic(lambda context, at, value: _store_as(types.uint64))
 
 def _compile(function: Callable[..., Any], **options: bool) -> Any:
     """A function as numba compiles it, bare of wrappers that check types while tests run."""
-    return njit(unwrap(function), **options)
+    return njit(unwrap(function), error_model="numpy", **options)
 
 
 # ── moves of values ──────────────────────────────────────────────────────────────────────────────────────
@@ -223,7 +223,7 @@ def _run(
         Why it ended. Unless DONE, the act at `state[AT]` in tick `state[AT_TICK]` needs the caller.
     """
     tick, at, until, final, clock = state[AT_TICK], state[AT], state[UNTIL], state[FINAL], state[CLOCK]
-    now = np.zeros(2, np.int64)
+    base, now = state[BASE], np.zeros(2, np.int64)
     t = span[0] + tick * span[1]
     acts = len(program)
     reason, result = DONE, 0
@@ -233,60 +233,60 @@ def _run(
     while tick < until or at > 0:
         while at < acts:
             act = program[at]
-            code = act[CODE]
-            if (act[EVERY] != 1 and tick % act[EVERY]) or tick + act[SPAN] > final:
+            code = program[at, CODE]
+            if (program[at, EVERY] != 1 and tick % program[at, EVERY]) or tick + program[at, SPAN] > final:
                 at += 1
                 continue
             if code == SET:
-                if not _move(moves, act[FIRST], act[LAST]):
+                if not _move(moves, program[at, FIRST], program[at, LAST]):
                     reason = REFUSED
-                elif act[COUNTED]:
+                elif program[at, COUNTED]:
                     result = _access3(
-                        act[FUNCTION], act[HANDLE], act[REFERENCES], act[COUNT], act[VALUES], act[COUNT]
+                        program[at, FUNCTION], program[at, HANDLE], program[at, REFERENCES], program[at, COUNT], program[at, VALUES], program[at, COUNT]
                     )
                 else:
-                    result = _access2(act[FUNCTION], act[HANDLE], act[REFERENCES], act[COUNT], act[VALUES])
+                    result = _access2(program[at, FUNCTION], program[at, HANDLE], program[at, REFERENCES], program[at, COUNT], program[at, VALUES])
             elif code == GET:
-                if act[COUNTED]:
+                if program[at, COUNTED]:
                     result = _access3(
-                        act[FUNCTION], act[HANDLE], act[REFERENCES], act[COUNT], act[VALUES], act[COUNT]
+                        program[at, FUNCTION], program[at, HANDLE], program[at, REFERENCES], program[at, COUNT], program[at, VALUES], program[at, COUNT]
                     )
                 else:
-                    result = _access2(act[FUNCTION], act[HANDLE], act[REFERENCES], act[COUNT], act[VALUES])
-                _move(moves, act[FIRST], act[LAST])
-                if not result and not _finite(act[CHECK], act[CHECKED]):
+                    result = _access2(program[at, FUNCTION], program[at, HANDLE], program[at, REFERENCES], program[at, COUNT], program[at, VALUES])
+                _move(moves, program[at, FIRST], program[at, LAST])
+                if not result and not _finite(program[at, CHECK], program[at, CHECKED]):
                     reason = INFINITE
             elif code == STEP:
-                if act[EVENT]:
+                if program[at, EVENT]:
                     result = _step3(
-                        act[FUNCTION],
-                        act[HANDLE],
+                        program[at, FUNCTION],
+                        program[at, HANDLE],
                         t,
                         own_steps[at],
-                        act[FLAG],
-                        act[EVENT],
-                        act[END],
-                        act[EARLY],
-                        act[REACHED],
+                        program[at, FLAG],
+                        program[at, EVENT],
+                        program[at, END],
+                        program[at, EARLY],
+                        program[at, REACHED],
                     )
-                    if not result and (_get_u1(act[END]) or _get_u1(act[EARLY])):
+                    if not result and (_get_u1(program[at, END]) or _get_u1(program[at, EARLY])):
                         reason = STATUS
                 else:
-                    result = _step2(act[FUNCTION], act[HANDLE], t, own_steps[at], act[FLAG])
+                    result = _step2(program[at, FUNCTION], program[at, HANDLE], t, own_steps[at], program[at, FLAG])
             elif code == MOVE:
-                _move(moves, act[FIRST], act[LAST])
+                _move(moves, program[at, FIRST], program[at, LAST])
             elif code == TABLE:
-                for m in range(act[COUNT]):
-                    _put_f8(act[VALUES] + 8 * m, _get_f8(act[REFERENCES] + 8 * m))
-                act[REFERENCES] += 8 * act[COUNT]
-                if not _finite(act[VALUES], act[COUNT]):
+                for m in range(program[at, COUNT]):
+                    _put_f8(program[at, VALUES] + 8 * m, _get_f8(program[at, REFERENCES] + 8 * m))
+                program[at, REFERENCES] += 8 * program[at, COUNT]
+                if not _finite(program[at, VALUES], program[at, COUNT]):
                     reason = INFINITE
             elif code == TICK:
                 tick += 1
                 t = span[0] + tick * span[1]
                 signals[0] = t
             elif code == ROW:
-                row = tick // act[EVERY] - state[BASE]
+                row = (tick if program[at, EVERY] == 1 else tick // program[at, EVERY]) - base
                 for m in range(len(columns)):
                     table[row, m] = signals[columns[m]]
             else:
@@ -294,8 +294,8 @@ def _run(
             if clock:
                 _clock(clock, 1, now.ctypes.data)
                 after = 1e9 * now[0] + now[1]
-                if act[WHO] >= 0 and reason != CALL:
-                    seconds[act[WHO]] += 1e-9 * (after - before)
+                if program[at, WHO] >= 0 and reason != CALL:
+                    seconds[program[at, WHO]] += 1e-9 * (after - before)
                 before = after
             if result or reason:
                 state[AT_TICK], state[AT], state[RESULT] = tick, at, result

@@ -94,7 +94,8 @@ class Program:
         base = plan.signals.ctypes.data
         held = zip(plan.hold_from, plan.hold_to, strict=True)
         first = self._add_moves((k.F8, base + 8 * int(a), base + 8 * int(b)) for a, b in held)
-        self._add(k.MOVE, {k.FIRST: first, k.LAST: len(self._moves)})
+        if plan.hold_to.size:
+            self._add(k.MOVE, {k.FIRST: first, k.LAST: len(self._moves)})
         self._add(k.ROW, {k.EVERY: every})
         self.table = np.zeros((len(self._lines), k.WIDTH), dtype=np.int64)
         self.table[:, k.EVERY], self.table[:, k.WHO] = 1, -1

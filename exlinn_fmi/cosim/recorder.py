@@ -106,5 +106,5 @@ class Recorder:
         """The filled rows as a frame."""
         import pandas as pd
 
-        # A copy has its columns in one piece each, and does not hold the memory of a run that ended early.
-        return pd.DataFrame(self.table[: self.rows], columns=self.names, copy=True)
+        # The copy of a run that ended early does not hold the memory of the rows that it lacks.
+        return pd.DataFrame(self.table[: self.rows], columns=self.names, copy=self.rows < len(self.table))
