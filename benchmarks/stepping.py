@@ -151,11 +151,19 @@ def in_c(
             visit.fmu = native.step.handle
             if x.inputs is not None:
                 (call,) = native.access("Set", x.inputs)
-                visit.set, visit.inputs, visit.input_count = call.function, address(call.references), len(x.inputs)
+                visit.set, visit.inputs, visit.input_count = (
+                    call.function,
+                    address(call.references),
+                    len(x.inputs),
+                )
                 visit.sources, visit.given = address(x.sources.astype(np.uintp)), address(x.given)
             if x.outputs is not None:
                 (call,) = native.access("Get", x.outputs)
-                visit.get, visit.outputs, visit.output_count = call.function, address(call.references), len(x.outputs)
+                visit.get, visit.outputs, visit.output_count = (
+                    call.function,
+                    address(call.references),
+                    len(x.outputs),
+                )
                 visit.taken = address(x.taken)
         step = [part.native().step for part in parts]
         handles = (ctypes.c_void_p * len(parts))(*(s.handle for s in step))
@@ -174,5 +182,32 @@ def in_c(
         for part in parts:
             part.close()
         return took
+
+    return seconds
+
+
+# ── other masters ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def by_fmpy() -> Callable[[int], float]:
+    """Seconds that FMPy's own loop takes for so many steps."""
+    folder = tempfile.TemporaryDirectory()
+    unzipped = fmpy.extract(FMU, folder.name)
+    description = fmpy.read_model_description(unzipped)
+    outputs = [v.name for v in description.modelVariables if v.causality in ("input", "output")]
+
+    def seconds(steps: int) -> float:
+        began = time.process_time()
+        fmpy.simulate_fmu(
+            unzipped,
+            stop_time=steps * STEP,
+            step_size=STEP,
+            output_interval=STEP,
+            fmi_type="CoSimulation",
+            output=outputs,
+            model_description=description,
+        )
+        _ = folder
+        return time.process_time() - began
 
     return seconds

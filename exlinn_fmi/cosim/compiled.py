@@ -7,7 +7,6 @@ the loop comes back to Python. Values, rows and errors are those of the plain st
 
 from __future__ import annotations
 
-import ctypes
 import time
 
 import numpy as np
@@ -16,7 +15,7 @@ from exlinn_fmi.components.base import Status, Values
 from exlinn_fmi.cosim.plan import Plan
 from exlinn_fmi.cosim.program import Program, Source
 from exlinn_fmi.cosim.recorder import Recorder
-from exlinn_fmi.cosim.stepping import Stepper
+from exlinn_fmi.cosim.stepping import Stepper, clock_address
 
 SHORTEST, LONGEST = 64, 2**15
 """Ticks that are done in one go: at first, and at most."""
@@ -45,13 +44,28 @@ class Compiled(Stepper):
 
         self._kernel, self._plan, self._recorder = kernel, plan, recorder
         self._start, self._step, self.chunk = start, step, SHORTEST
-        self._program = Program(plan, recorder.every, start)
+        self._program = Program(plan, recorder.every, start, step)
+        self._calls = [act.call or _nothing for act in self._program.acts]
         self._columns = np.asarray(plan.columns, dtype=np.int64)
         self._span = np.array([start, step])
         self.seconds: Values = np.zeros(len(plan.components))
         self._state = np.zeros(kernel.STATES, dtype=np.int64)
         self._state[kernel.FINAL] = plan.ticks
         self._state[kernel.CLOCK] = clock_address() if profile else 0
+        arrays = {
+            kernel.PROGRAM: self._program.table,
+            kernel.MOVES: self._program.moves,
+            kernel.COLUMNS: self._columns,
+            kernel.SIGNALS: plan.signals,
+            kernel.OWN_STEPS: self._program.own_steps,
+            kernel.TIMES: self._span,
+            kernel.SECONDS: self.seconds,
+            kernel.STATE: self._state,
+        }
+        self._arguments = np.zeros(kernel.ARGUMENTS, dtype=np.int64)
+        self._arguments[list(arrays)] = [array.ctypes.data for array in arrays.values()]
+        self._arguments[kernel.ACROSS] = len(self._columns)
+        self._loop, self._where = kernel.load(), self._arguments.ctypes.data
 
     def run(self, first: int, until: int) -> None:
         """Step from tick `first` to tick `until` and record the rows in between and that of `until`.
@@ -60,58 +74,46 @@ class Compiled(Stepper):
             RunError: a component failed or gave a value that is not finite.
         """
         k, state, began = self._kernel, self._state, time.perf_counter()
-        tables = [self._tabulate(source, first, until) for source in self._program.sources]
+        self._tables = [self._tabulate(source, first, until) for source in self._program.sources]
         state[k.AT_TICK], state[k.AT], state[k.UNTIL], state[k.BASE] = first, 0, until, self._recorder.base
+        self._aim()
+        loop, where, calls, reasons = self._loop, self._where, self._calls, k.REASONS
+        tick = memoryview(state.data)[k.AT_TICK :]
         try:
-            while reason := self._loop():
-                self._see_to(reason)
-                state[k.AT] += 1
+            while reason := loop(where):
+                if reason % reasons == k.CALL:
+                    calls[reason // reasons](tick[0])
+                else:
+                    self._see_to(reason % reasons, reason // reasons)
         finally:
-            recorded = state[k.AT_TICK] - (state[k.AT] > self._program.tick)
+            recorded = tick[0] - (state[k.AT] > self._program.tick)
             self._recorder.rows = int(recorded) // self._recorder.every + 1
-        for source, table in zip(self._program.sources, tables, strict=True):
+        for source in self._program.sources:
             self._follow(source, first, until)
-            del table
         took = time.perf_counter() - began
         self.chunk = int(np.clip(self.chunk * IN_ONE_GO / took, SHORTEST, min(2 * self.chunk, LONGEST)))
 
-    def _loop(self, acts: int | None = None) -> int:
-        """Let the loop go on, with the first so many acts of the program only; gives why it ended."""
-        program = self._program
-        reason: int = self._kernel.run(
-            program.table[:acts],
-            program.moves,
-            self._columns,
-            self._plan.signals,
-            self._recorder.table,
-            program.own_steps,
-            self._span,
-            self.seconds,
-            self._state,
-        )
-        return reason
+    def _aim(self, acts: int | None = None) -> None:
+        """Point the loop at its arrays, and at the first so many acts of the program only."""
+        k, program, recorder = self._kernel, self._program, self._recorder
+        self._arguments[k.ACTS] = len(program.acts) if acts is None else acts
+        self._arguments[k.ROWS] = recorder.table.ctypes.data
 
-    def _see_to(self, reason: int) -> None:
-        """Do what the loop cannot, at the line where it stands.
+    def _see_to(self, reason: int, line: int) -> None:
+        """Do what the loop cannot, for an act of the program.
 
         Raises:
             RunError: a component failed or gave a value that is not finite.
         """
-        k, plan, state = self._kernel, self._plan, self._state
-        line, tick = int(state[k.AT]), int(state[k.AT_TICK])
-        act, t = self._program.acts[line], self._start + tick * self._step
-        if reason == k.CALL:
-            assert act.call is not None
-            act.call(tick, t)
-        elif reason == k.STATUS:
+        plan, act = self._plan, self._program.acts[line]
+        t = self._start + int(self._state[self._kernel.AT_TICK]) * self._step
+        if reason == self._kernel.STATUS:
             self._heed(line, t)
-        elif reason == k.INFINITE:
-            assert act.exchange is not None
-            plan.check_finite(act.exchange, t)
-        else:  # a value that its type cannot hold: the component says so itself
-            assert act.exchange is not None
+        if act.exchange is not None and reason == self._kernel.REFUSED:
             assert act.vector is not None
-            plan.exchange(act.exchange, act.vector, t)
+            plan.exchange(act.exchange, act.vector, t)  # which ends in an error
+        elif act.exchange is not None and act.exchange.outputs is not None:
+            plan.check_finite(act.exchange, t)
 
     def _heed(self, line: int, t: float) -> None:
         """Count a warning of a C function, or stop on anything worse.
@@ -121,23 +123,22 @@ class Compiled(Stepper):
         Raises:
             RunError: it was worse.
         """
-        k, state, act = self._kernel, self._state, self._program.acts[line]
-        last, tick, until, worst = line + act.more, state[k.AT_TICK], int(state[k.UNTIL]), Status.OK
+        k, state, acts = self._kernel, self._state, self._program.acts
+        last, tick, until, worst = line + acts[line].more, state[k.AT_TICK], int(state[k.UNTIL]), Status.OK
         state[k.UNTIL] = tick
-        reason = k.STATUS
+        self._aim(last + 1)
+        reason, at = k.STATUS, line
         while reason == k.STATUS and worst < Status.DISCARD:
-            native = self._program.acts[state[k.AT]].native
+            native = acts[at].native
             assert native is not None
-            worst = max(worst, native.heed(self._program.acts[state[k.AT]].name, int(state[k.RESULT])))
-            state[k.AT] += 1
-            reason = self._loop(last + 1)
+            worst = max(worst, native.heed(acts[at].name, int(state[k.RESULT])))
+            at, reason = divmod(self._loop(self._where), k.REASONS)
         if reason == k.REFUSED:
-            self._see_to(reason)  # which ends in an error
-        state[k.UNTIL], state[k.AT_TICK], state[k.AT] = until, tick, last
+            self._see_to(reason, at)
+        state[k.UNTIL], state[k.AT_TICK], state[k.AT] = until, tick, last + 1
+        self._aim()
         if worst != Status.OK:
-            self._plan.judge(int(self._program.table[line, k.WHO]), worst, act.what, t)
-        if act.exchange is not None and act.exchange.outputs is not None:
-            self._plan.check_finite(act.exchange, t)
+            self._plan.judge(int(self._program.table[line, k.WHO]), worst, acts[line].what, t)
 
     # ── functions of time ────────────────────────────────────────────────────────────────────────────────
 
@@ -171,9 +172,5 @@ class Compiled(Stepper):
             )
 
 
-def clock_address() -> int:
-    """Where the system's clock_gettime lies, 0 where there is none."""
-    try:
-        return ctypes.cast(ctypes.CDLL(None).clock_gettime, ctypes.c_void_p).value or 0
-    except (AttributeError, OSError, TypeError):
-        return 0
+def _nothing(tick: int) -> None:
+    """For acts that need no call of Python."""

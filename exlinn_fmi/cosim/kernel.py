@@ -10,22 +10,24 @@ it; the tests hold it to the plain stepping, bit by bit.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
+from functools import cache
 from inspect import unwrap
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import carray, cfunc, njit, types
 from numba.extending import intrinsic
 
 # Acts of a program, in column CODE.
-SET, GET, STEP, TABLE, MOVE, TICK, ROW, PYTHON = range(8)
+SET, GET, STEP, TABLE, MOVE, TICK, ROW, FINITE, PYTHON = range(9)
 
 # Columns of a program. An act is done at every EVERY-th tick, unless SPAN ticks from there lead beyond the
 # end; WHO is a component's number or −1. SET, GET: function, handle, references, count and values are the
-# arguments; moves from FIRST to LAST are done before SET and after GET; CHECKED values from CHECK on must be
-# finite after GET.
+# arguments; moves from FIRST to LAST are done before SET and PYTHON, and after GET; CHECKED values from CHECK
+# on must be finite after GET and FINITE.
 CODE, EVERY, SPAN, WHO, FUNCTION, HANDLE = range(6)
 REFERENCES, COUNT, VALUES, COUNTED, FIRST, LAST, CHECK, CHECKED = range(6, 14)
 FLAG, EVENT, END, EARLY, REACHED = range(6, 11)  # STEP; EVENT is 0 in FMI 2
@@ -35,8 +37,13 @@ WIDTH = 14
 AT_TICK, AT, UNTIL, FINAL, BASE, RESULT, CLOCK = range(7)
 STATES = 7
 
+# What the loop is given: where its arrays lie; their lengths matter no more than their number of columns.
+PROGRAM, MOVES, COLUMNS, SIGNALS, ROWS, OWN_STEPS, TIMES, SECONDS, STATE, ACTS, ACROSS = range(11)
+ARGUMENTS = 11
+
 # Why the loop returned.
 DONE, CALL, STATUS, REFUSED, INFINITE = range(5)
+REASONS = 8
 
 # Kinds of moves between memory cells: as they are, from float64 to a type, from a type to float64.
 FROM = 16
@@ -82,10 +89,20 @@ def _store_as(kind: Any) -> Any:  # pragma: no cover - runs while numba compiles
     return types.void(types.int64, kind), code
 
 
+def _as_pointer() -> Any:  # pragma: no cover - runs while numba compiles
+    """Type and code of taking an address for a pointer."""
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.inttoptr(values[0], context.get_value_type(types.voidptr))
+
+    return types.voidptr(types.int64), code
+
+
 _access2 = intrinsic(lambda context, f, handle, references, count, values: _c_function("iiii"))
 _access3 = intrinsic(lambda context, f, handle, references, count, values, again: _c_function("iiiii"))
 _step2 = intrinsic(lambda context, f, handle, t, h, flag: _c_function("iddi"))
 _step3 = intrinsic(lambda context, f, handle, t, h, flag, event, end, early, reached: _c_function("iddiiiii"))
+_pointer = intrinsic(lambda context, at: _as_pointer())
 _clock = intrinsic(lambda context, f, which, out: _c_function("ii"))
 
 _get_f8 = intrinsic(lambda context, at: _load_as(types.float64))
@@ -220,7 +237,8 @@ def _run(
         state: see above.
 
     Returns:
-        Why it ended. Unless DONE, the act at `state[AT]` in tick `state[AT_TICK]` needs the caller.
+        Why it ended, and `REASONS` times the number of the act that needs the caller if it is not DONE; the
+        loop goes on with the one after it.
     """
     tick, at, until, final, clock = state[AT_TICK], state[AT], state[UNTIL], state[FINAL], state[CLOCK]
     base, now = state[BASE], np.zeros(2, np.int64)
@@ -232,7 +250,6 @@ def _run(
     before = 1e9 * now[0] + now[1]
     while tick < until or at > 0:
         while at < acts:
-            act = program[at]
             code = program[at, CODE]
             if (program[at, EVERY] != 1 and tick % program[at, EVERY]) or tick + program[at, SPAN] > final:
                 at += 1
@@ -242,17 +259,39 @@ def _run(
                     reason = REFUSED
                 elif program[at, COUNTED]:
                     result = _access3(
-                        program[at, FUNCTION], program[at, HANDLE], program[at, REFERENCES], program[at, COUNT], program[at, VALUES], program[at, COUNT]
+                        program[at, FUNCTION],
+                        program[at, HANDLE],
+                        program[at, REFERENCES],
+                        program[at, COUNT],
+                        program[at, VALUES],
+                        program[at, COUNT],
                     )
                 else:
-                    result = _access2(program[at, FUNCTION], program[at, HANDLE], program[at, REFERENCES], program[at, COUNT], program[at, VALUES])
+                    result = _access2(
+                        program[at, FUNCTION],
+                        program[at, HANDLE],
+                        program[at, REFERENCES],
+                        program[at, COUNT],
+                        program[at, VALUES],
+                    )
             elif code == GET:
                 if program[at, COUNTED]:
                     result = _access3(
-                        program[at, FUNCTION], program[at, HANDLE], program[at, REFERENCES], program[at, COUNT], program[at, VALUES], program[at, COUNT]
+                        program[at, FUNCTION],
+                        program[at, HANDLE],
+                        program[at, REFERENCES],
+                        program[at, COUNT],
+                        program[at, VALUES],
+                        program[at, COUNT],
                     )
                 else:
-                    result = _access2(program[at, FUNCTION], program[at, HANDLE], program[at, REFERENCES], program[at, COUNT], program[at, VALUES])
+                    result = _access2(
+                        program[at, FUNCTION],
+                        program[at, HANDLE],
+                        program[at, REFERENCES],
+                        program[at, COUNT],
+                        program[at, VALUES],
+                    )
                 _move(moves, program[at, FIRST], program[at, LAST])
                 if not result and not _finite(program[at, CHECK], program[at, CHECKED]):
                     reason = INFINITE
@@ -272,7 +311,9 @@ def _run(
                     if not result and (_get_u1(program[at, END]) or _get_u1(program[at, EARLY])):
                         reason = STATUS
                 else:
-                    result = _step2(program[at, FUNCTION], program[at, HANDLE], t, own_steps[at], program[at, FLAG])
+                    result = _step2(
+                        program[at, FUNCTION], program[at, HANDLE], t, own_steps[at], program[at, FLAG]
+                    )
             elif code == MOVE:
                 _move(moves, program[at, FIRST], program[at, LAST])
             elif code == TABLE:
@@ -289,7 +330,11 @@ def _run(
                 row = (tick if program[at, EVERY] == 1 else tick // program[at, EVERY]) - base
                 for m in range(len(columns)):
                     table[row, m] = signals[columns[m]]
+            elif code == FINITE:
+                if not _finite(program[at, CHECK], program[at, CHECKED]):
+                    reason = INFINITE
             else:
+                _move(moves, program[at, FIRST], program[at, LAST])
                 reason = CALL
             if clock:
                 _clock(clock, 1, now.ctypes.data)
@@ -298,13 +343,40 @@ def _run(
                     seconds[program[at, WHO]] += 1e-9 * (after - before)
                 before = after
             if result or reason:
-                state[AT_TICK], state[AT], state[RESULT] = tick, at, result
-                return reason or STATUS
+                state[AT_TICK], state[AT], state[RESULT] = tick, at + 1, result
+                return (reason or STATUS) + REASONS * at  # type: ignore[no-any-return]
             at += 1
         at = 0
     state[AT_TICK], state[AT] = tick, at
     return DONE
 
 
-run = _compile(_run, cache=True, nogil=True)
-"""`_run`, compiled."""
+_loop = _compile(_run)
+
+
+def _entry(context: int) -> int:  # pragma: no cover - compiled
+    """`_run` with its arguments read from memory: a call from Python costs no more than one of C then."""
+    where = carray(_pointer(context), ARGUMENTS, np.int64)
+    return _loop(  # type: ignore[no-any-return]
+        carray(_pointer(where[PROGRAM]), (where[ACTS], WIDTH), np.int64),
+        carray(_pointer(where[MOVES]), (where[ACTS], 3), np.int64),
+        carray(_pointer(where[COLUMNS]), where[ACROSS], np.int64),
+        carray(_pointer(where[SIGNALS]), where[ACROSS], np.float64),
+        carray(_pointer(where[ROWS]), (where[ACTS], where[ACROSS]), np.float64),
+        carray(_pointer(where[OWN_STEPS]), where[ACTS], np.float64),
+        carray(_pointer(where[TIMES]), 2, np.float64),
+        carray(_pointer(where[SECONDS]), where[ACTS], np.float64),
+        carray(_pointer(where[STATE]), STATES, np.int64),
+    )
+
+
+@cache
+def load() -> Callable[[int], int]:
+    """The compiled loop as a C function: it takes the address of its arguments and gives why it ended.
+
+    Other threads of Python run while it does.
+    """
+    function = cfunc(types.int64(types.int64), cache=True)(unwrap(_entry))
+    call: Callable[[int], int] = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)(function.address)
+    call.compiled = function  # type: ignore[attr-defined]  # which owns the code
+    return call

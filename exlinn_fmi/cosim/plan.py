@@ -303,18 +303,21 @@ class Plan:
             self.exchange(a.after, self.ahead, t + a.h)
 
     def exchange(self, x: Exchange, vector: Values, t: float) -> None:
-        """Do an exchange and check what comes of it."""
+        """Do an exchange with inputs from `vector`, and check what comes of it."""
+        if x.inputs is not None:
+            x.given[:] = vector[x.sources]
+        self.trade(x, t)
+        # Sum of squares: several times faster than isfinite, and finite only if all are.
+        if x.outputs is not None and not x.taken.dot(x.taken) < math.inf:
+            self.check_finite(x, t)
+
+    def trade(self, x: Exchange, t: float) -> None:
+        """Set what is given and get what is taken of a component."""
         try:
-            if x.inputs is not None:
-                x.given[:] = vector[x.sources]
-                if status := x.set(x.inputs, x.given):
-                    self.judge(x.component, status, "setting inputs", t)
-            if x.outputs is not None:
-                if status := x.get(x.outputs, x.taken):
-                    self.judge(x.component, status, "reading outputs", t)
-                # Sum of squares: several times faster than isfinite, and finite only if all are.
-                if not x.taken.dot(x.taken) < math.inf:
-                    self.check_finite(x, t)
+            if x.inputs is not None and (status := x.set(x.inputs, x.given)):
+                self.judge(x.component, status, "setting inputs", t)
+            if x.outputs is not None and (status := x.get(x.outputs, x.taken)):
+                self.judge(x.component, status, "reading outputs", t)
         except RunError:
             raise
         except Exception as error:

@@ -30,7 +30,7 @@ class Act:
         native: the C functions that it is one of.
         exchange: it is part of.
         vector: that the exchange reads.
-        call: what to do from Python in its place, given tick and time [s].
+        call: what to do from Python in its place, given the tick.
         more: calls that follow it and belong to the same set or get.
     """
 
@@ -39,7 +39,7 @@ class Act:
     native: Native | None = None
     exchange: Exchange | None = None
     vector: Values | None = None
-    call: Callable[[int, float], None] | None = None
+    call: Callable[[int], None] | None = None
     more: int = 0
 
 
@@ -58,7 +58,8 @@ class Program:
     Args:
         plan: initialised.
         every: a row is recorded at every so many ticks.
-        t: present time [s].
+        start: start time [s].
+        step: step of the master [s].
 
     Attributes:
         table: (acts, `kernel.WIDTH`), see `kernel.py`.
@@ -69,8 +70,8 @@ class Program:
         sources: components whose values are tabulated.
     """
 
-    def __init__(self, plan: Plan, every: int, t: float) -> None:
-        self._plan, self._now = plan, np.array([t])
+    def __init__(self, plan: Plan, every: int, start: float, step: float) -> None:
+        self._plan, self._start, self._step = plan, start, step
         self._natives = [component.native() for component in plan.components]
         self._lines: list[Columns] = []
         self._moves: list[tuple[int, int, int]] = []
@@ -104,11 +105,14 @@ class Program:
         self.moves = np.array(self._moves or [(0, 0, 0)], dtype=np.int64)
         self.own_steps = np.array(self._own)
 
+    def _time(self, tick: int) -> float:
+        return self._start + tick * self._step
+
     def _is_source(self, x: Exchange) -> bool:
         """Whether an exchange reads what depends on time alone."""
         if x.inputs is not None or x.outputs is None:
             return False
-        return self._plan.components[x.component].outputs_over(x.outputs, self._now) is not None
+        return self._plan.components[x.component].outputs_over(x.outputs, np.array([self._start])) is not None
 
     def _add(self, code: int, columns: Columns | None = None, act: Act | None = None, h: float = 0.0) -> int:
         """Add a line; gives its number."""
@@ -127,7 +131,7 @@ class Program:
         """A step, with its exchanges before and after in Gauss–Seidel."""
         native, due = self._natives[a.component], {k.EVERY: a.every, k.SPAN: a.every}
         if native is None:
-            self._add(k.PYTHON, due, Act(call=lambda tick, t: self._plan.step(a, tick, t)))
+            self._add(k.PYTHON, due, Act(call=lambda tick: self._plan.step(a, tick, self._time(tick))))
             return
         if a.before is not None:
             self._add_exchange(a.before, self._plan.ahead, due)
@@ -147,13 +151,19 @@ class Program:
     def _add_exchange(self, x: Exchange, vector: Values, due: Columns) -> None:
         """An exchange: the calls that set, then those that get."""
         native, who = self._natives[x.component], {**due, k.WHO: x.component}
-        if native is None:
-            self._add(k.PYTHON, due, Act(call=lambda tick, t: self._plan.exchange(x, vector, t)))
-            return
+        first = len(self._moves)
         if x.inputs is not None:
             sources = vector.ctypes.data + 8 * x.sources
             given = zip(sources.tolist(), _addresses(x.given), strict=True)
-            first = self._add_moves((k.F8, a, b) for a, b in given)
+            self._add_moves((k.F8, a, b) for a, b in given)
+        check = {k.CHECK: _address(x.taken), k.CHECKED: len(x.taken)}
+        if native is None:
+            act = Act(call=lambda tick: self._plan.trade(x, self._time(tick)))
+            self._add(k.PYTHON, {**due, k.FIRST: first, k.LAST: len(self._moves)}, act)
+            if x.outputs is not None:
+                self._add(k.FINITE, {**due, **check}, Act(exchange=x))
+            return
+        if x.inputs is not None:
             calls = native.access("Set", x.inputs)
             for n, call in enumerate(calls, 1):
                 values, kind = self._buffer(call, x.given)
@@ -174,7 +184,7 @@ class Program:
                     self._add_moves((kind + k.FROM, a, b) for a, b in cells)
                 columns = {**who, **_arguments(call, values), k.FIRST: first, k.LAST: len(self._moves)}
                 if n == len(calls):
-                    columns |= {k.CHECK: _address(x.taken), k.CHECKED: len(x.taken)}
+                    columns |= check
                 act = Act("reading outputs", call.name, native, x, vector, more=len(calls) - n)
                 self._add(k.GET, columns, act)
 
