@@ -1,10 +1,11 @@
-"""Cost of a communication step: our master beside a loop in C and other masters, on the same FMU in the same run.
+"""Cost of a communication step: ours beside a loop in C and other masters, on the same FMU in the same run.
 
     python benchmarks/stepping.py [--quick] [--only NAME …] [--json FILE]
 
-Times are CPU times per step with all outputs recorded, without load and start of the FMU, the best of several
-runs that alternate. `over_c` is our time over that of `stepping_loop.c`, built here with the C compiler that is
-found; it makes the same calls. FMPy, libcosim and ecos are the packages `fmpy`, `libcosimpy`, `ecospy`.
+Times are CPU times per step with all outputs recorded, without load and start of the FMU, the best of
+several runs that alternate. `over_c` is our time over that of `stepping_loop.c`, built here with the C
+compiler that is found; it makes the same calls. FMPy, libcosim and ecos are the packages `fmpy`,
+`libcosimpy` and `ecospy`; ecos records by writing a CSV file, `ecos_unrecorded` does not record at all.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import argparse
 import ctypes
 import json
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -27,11 +29,14 @@ import pandas as pd
 from exlinn_fmi.components.base import Component, Variable
 from exlinn_fmi.components.fmu import FmuComponent
 from exlinn_fmi.components.python import PythonComponent
+from exlinn_fmi.components.signals import SignalSource
 from exlinn_fmi.cosim.graph import Graph
 from exlinn_fmi.cosim.master import Master
 from exlinn_fmi.cosim.plan import Plan
 from exlinn_fmi.cosim.recorder import select
+from exlinn_fmi.data.files import write_table
 from exlinn_fmi.export.build import find_compiler
+from exlinn_fmi.scenario.signals import Sine
 
 FMU = Path(__file__).parents[1] / "fmus" / "DCMotorCart.fmu"
 STEP = 1e-3
@@ -122,7 +127,7 @@ def c_loop() -> Iterator[ctypes.CDLL]:
     """The loop in C, built."""
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder) / "loop.so"
-        source = Path(__file__).with_suffix("").with_name("stepping_loop.c")
+        source = Path(__file__).with_name("stepping_loop.c")
         flags = ["-O2", "-std=c99", "-shared", "-fPIC"]
         subprocess.run([*find_compiler(), *flags, str(source), "-o", str(library)], check=True)
         yield ctypes.CDLL(str(library))
@@ -189,7 +194,7 @@ def in_c(
 # ── other masters ────────────────────────────────────────────────────────────────────────────────────────
 
 
-def by_fmpy() -> Callable[[int], float]:
+def by_fmpy(make_input: Callable[[int], np.ndarray] | None = None) -> Callable[[int], float]:
     """Seconds that FMPy's own loop takes for so many steps."""
     folder = tempfile.TemporaryDirectory()
     unzipped = fmpy.extract(FMU, folder.name)
@@ -197,17 +202,165 @@ def by_fmpy() -> Callable[[int], float]:
     outputs = [v.name for v in description.modelVariables if v.causality in ("input", "output")]
 
     def seconds(steps: int) -> float:
+        _ = folder  # which goes with this function
+        given = None if make_input is None else make_input(steps)
         began = time.process_time()
         fmpy.simulate_fmu(
-            unzipped,
-            stop_time=steps * STEP,
-            step_size=STEP,
-            output_interval=STEP,
-            fmi_type="CoSimulation",
-            output=outputs,
-            model_description=description,
-        )
-        _ = folder
+            unzipped, stop_time=steps * STEP, step_size=STEP, output_interval=STEP, fmi_type="CoSimulation",
+            output=outputs, input=given, model_description=description,
+        )  # fmt: skip
         return time.process_time() - began
 
     return seconds
+
+
+def by_libcosim() -> Callable[[int], float]:
+    """Seconds that libcosim takes, all outputs in its time series observer."""
+    from libcosimpy.CosimEnums import CosimVariableType
+    from libcosimpy.CosimExecution import CosimExecution
+    from libcosimpy.CosimObserver import CosimObserver
+    from libcosimpy.CosimSlave import CosimLocalSlave
+
+    description = fmpy.read_model_description(str(FMU))
+    references = [v.valueReference for v in description.modelVariables if v.causality in ("input", "output")]
+
+    def seconds(steps: int) -> float:
+        execution = CosimExecution.from_step_size(1e9 * STEP)
+        slave = execution.add_local_slave(CosimLocalSlave(str(FMU), "plant"))
+        observer = CosimObserver.create_time_series(steps + 1)
+        assert execution.add_observer(observer)
+        for reference in references:
+            assert observer.start_time_series(slave, reference, CosimVariableType.REAL)
+        began = time.process_time()
+        assert execution.step(steps)
+        return time.process_time() - began
+
+    return seconds
+
+
+def by_ecos(record: bool) -> Callable[[int], float]:
+    """Seconds that ecos takes; it records by writing a CSV file, all outputs."""
+    library = Path(sys.prefix) / "lib" / "libtbb.so.12"
+    ctypes.CDLL(str(library), ctypes.RTLD_GLOBAL)
+    from ecospy import EcosLib, EcosSimulation, EcosSimulationStructure
+
+    def seconds(steps: int) -> float:
+        with tempfile.TemporaryDirectory() as folder, EcosSimulationStructure() as structure:
+            EcosLib.set_log_level("off")
+            structure.add_model("plant", FMU)
+            with EcosSimulation(structure=structure, step_size=STEP) as simulation:
+                if record:
+                    simulation.add_csv_writer(str(Path(folder) / "out.csv"))
+                simulation.init()
+                began = time.process_time()
+                simulation.step(steps)
+                took = time.process_time() - began
+                simulation.terminate()
+                return took
+
+    return seconds
+
+
+# ── figures ──────────────────────────────────────────────────────────────────────────────────────────────
+
+Figures = dict[str, float]
+
+
+def over_c(name: str, make: Make, wires: Connections, steps: int, record: Sequence[str] = ("*",)) -> Figures:
+    """Our time and that of the loop in C."""
+    with c_loop() as library:
+        mine, c = per_step([ours(make, wires, record), in_c(library, make, wires, record)], steps)
+    return {f"{name}.us_per_step": mine, f"{name}.c_us_per_step": c, f"{name}.over_c": mine / c}
+
+
+def fmus(quick: bool) -> Figures:
+    """One FMU, and two that drive each other."""
+    steps = 20_000 if quick else 100_000
+    both = [("a.alpha_dot", "b.v"), ("b.alpha_dot", "a.v")]
+    return over_c("one_fmu", one_fmu, [], steps) | over_c("two_fmus", two_fmus, both, steps)
+
+
+def circle(quick: bool) -> Figures:
+    """Many FMUs in a ring."""
+    size = 50 if quick else 1000
+    make, wires = ring(size)
+    return over_c("ring", make, wires, 200 if quick else 1000, ["*.alpha_dot"]) | {"ring.components": size}
+
+
+def with_python(quick: bool) -> Figures:
+    """An FMU and a controller in Python."""
+    wires = [("plant.i", "control.i"), ("control.v", "plant.v")]
+    (took,) = per_step([ours(fmu_and_python, wires)], 5_000 if quick else 50_000)
+    return {"fmu_python.us_per_step": took}
+
+
+def others(quick: bool) -> Figures:
+    """FMPy, libcosim and ecos on one FMU, all outputs recorded."""
+    steps = 5_000 if quick else 50_000
+    names = ["ours", "fmpy", "libcosim", "ecos", "ecos_unrecorded"]
+    makers = [ours(one_fmu, []), by_fmpy(), by_libcosim(), by_ecos(True), by_ecos(False)]
+    took = dict(zip(names, per_step(makers, steps, 3), strict=True))
+    figures = {f"{name}.us_per_step": value for name, value in took.items()}
+    return figures | {f"{name}_over_ours": took[name] / took["ours"] for name in names[1:]}
+
+
+def driven(quick: bool) -> Figures:
+    """FMPy and ours on one FMU whose input is a signal."""
+
+    def make() -> list[Component]:
+        return [SignalSource("drive", Sine(signal="sine", amplitude=12, frequency=1.0), Path()), *one_fmu()]
+
+    def wave(steps: int) -> np.ndarray:
+        t = STEP * np.arange(steps + 1)
+        return np.array(list(zip(t, 12 * np.sin(2 * np.pi * t), strict=True)), dtype=[("time", float), ("v", float)])
+
+    mine, theirs = per_step([ours(make, [("drive.y", "plant.v")]), by_fmpy(wave)], 5_000 if quick else 50_000, 3)
+    return {"driven.us_per_step": mine, "driven.fmpy_us_per_step": theirs, "driven.fmpy_over_ours": theirs / mine}
+
+
+def files(quick: bool) -> Figures:
+    """Rows of three columns onto the disk."""
+    rows = 100_000 if quick else 1_000_000
+    frame = pd.DataFrame(np.random.default_rng(0).normal(size=(rows, 3)), columns=["time", "a.y", "b.y"])
+    with tempfile.TemporaryDirectory() as folder:
+        stem = Path(folder) / "t"
+
+        def seconds(forms: tuple[str, ...]) -> float:
+            began = time.process_time()
+            write_table(stem, frame, {}, forms)
+            return 1e6 * (time.process_time() - began) / rows
+
+        csv, parquet = best([lambda: seconds(("csv",)), lambda: seconds(("parquet",))], 3)
+    return {"csv.us_per_row": csv, "parquet.us_per_row": parquet}
+
+
+FIGURES: dict[str, Callable[[bool], Figures]] = {
+    "fmus": fmus,
+    "python": with_python,
+    "others": others,
+    "driven": driven,
+    "files": files,
+    "ring": circle,
+}
+"""What is measured: each makes figures, given whether to be quick."""
+
+
+def main() -> None:
+    """Measure, print, and write JSON where asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="fewer steps")
+    parser.add_argument("--only", nargs="+", choices=FIGURES, default=list(FIGURES), help="what to measure")
+    parser.add_argument("--json", type=Path, help="file to write")
+    options = parser.parse_args()
+    figures: Figures = {}
+    for name in options.only:
+        new = FIGURES[name](options.quick)
+        for key, value in new.items():
+            print(f"{key:<28} {value:10.4g}", flush=True)
+        figures |= new
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
