@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import ctypes
 import json
-import subprocess
 import sys
 import tempfile
 import time
@@ -24,7 +23,7 @@ from typing import Any
 
 import fmpy
 import numpy as np
-import pandas as pd
+import pyarrow as pa
 
 from exlinn_fmi.components.base import Component, Variable
 from exlinn_fmi.components.fmu import FmuComponent
@@ -34,9 +33,9 @@ from exlinn_fmi.cosim.graph import Graph
 from exlinn_fmi.cosim.master import Master
 from exlinn_fmi.cosim.plan import Plan
 from exlinn_fmi.cosim.recorder import select
-from exlinn_fmi.data.files import write_table
-from exlinn_fmi.export.build import find_compiler
+from exlinn_fmi.data.files import csv_file, parquet_file
 from exlinn_fmi.scenario.signals import Sine
+from exlinn_fmi.toolchain import compile_library, find_compiler
 
 FMU = Path(__file__).parents[1] / "fmus" / "DCMotorCart.fmu"
 STEP = 1e-3
@@ -90,12 +89,14 @@ def best(measures: Sequence[Callable[[], float]], runs: int = 5) -> list[float]:
     return [min(column) for column in zip(*results, strict=True)]
 
 
-def per_step(measures: Sequence[Callable[[int], float]], steps: int, runs: int = 5) -> list[float]:
+def per_step(
+    measures: Sequence[Callable[[int], float]], steps: int | Sequence[int], runs: int = 5
+) -> list[float]:
     """µs per step of each, without what a run costs before its first step."""
-    few = steps // 10
-    more = best([lambda m=m: m(steps) for m in measures], runs)
-    less = best([lambda m=m: m(few) for m in measures], runs)
-    return [1e6 * (a - b) / (steps - few) for a, b in zip(more, less, strict=True)]
+    many = [steps] * len(measures) if isinstance(steps, int) else steps
+    more = best([lambda m=m, n=n: m(n) for m, n in zip(measures, many, strict=True)], runs)
+    less = best([lambda m=m, n=n: m(n // 10) for m, n in zip(measures, many, strict=True)], runs)
+    return [1e6 * (a - b) / (n - n // 10) for a, b, n in zip(more, less, many, strict=True)]
 
 
 def ours(make: Make, wires: Connections, record: Sequence[str] = ("*",)) -> Callable[[int], float]:
@@ -126,10 +127,11 @@ class _Visit(ctypes.Structure):
 def c_loop() -> Iterator[ctypes.CDLL]:
     """The loop in C, built."""
     with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder) / "loop.so"
-        source = Path(__file__).with_name("stepping_loop.c")
-        flags = ["-O2", "-std=c99", "-shared", "-fPIC"]
-        subprocess.run([*find_compiler(), *flags, str(source), "-o", str(library)], check=True)
+        source, library = Path(__file__).with_name("stepping_loop.c"), Path(folder) / "loop.so"
+        sources = {source.name: source.read_bytes()}
+        library.write_bytes(
+            compile_library(sources, source.name, library.name, ["-O2", "-std=c99"], find_compiler())
+        )
         yield ctypes.CDLL(str(library))
 
 
@@ -178,8 +180,9 @@ def in_c(
         began = time.process_time()
         table = np.empty((steps + 1, len(columns)))
         failed = library.run(
-            size(len(visits)), visits, size(len(parts)), handles, functions, size(steps), number(0.0), number(STEP),
-            size(len(columns)), real(columns.ctypes.data), real(plan.signals.ctypes.data), real(table.ctypes.data),
+            size(len(visits)), visits, size(len(parts)), handles, functions, size(steps), number(0.0),
+            number(STEP), size(len(columns)), real(columns.ctypes.data), real(plan.signals.ctypes.data),
+            real(table.ctypes.data),
         )  # fmt: skip
         took = time.process_time() - began
         assert not failed
@@ -218,9 +221,11 @@ def by_libcosim() -> Callable[[int], float]:
     """Seconds that libcosim takes, all outputs in its time series observer."""
     from libcosimpy.CosimEnums import CosimVariableType
     from libcosimpy.CosimExecution import CosimExecution
+    from libcosimpy.CosimLogging import CosimLogLevel, log_output_level
     from libcosimpy.CosimObserver import CosimObserver
     from libcosimpy.CosimSlave import CosimLocalSlave
 
+    log_output_level(CosimLogLevel.WARNING)
     description = fmpy.read_model_description(str(FMU))
     references = [v.valueReference for v in description.modelVariables if v.causality in ("input", "output")]
 
@@ -296,10 +301,10 @@ def with_python(quick: bool) -> Figures:
 
 def others(quick: bool) -> Figures:
     """FMPy, libcosim and ecos on one FMU, all outputs recorded."""
-    steps = 5_000 if quick else 50_000
+    few, many = (5_000, 20_000) if quick else (20_000, 100_000)
     names = ["ours", "fmpy", "libcosim", "ecos", "ecos_unrecorded"]
     makers = [ours(one_fmu, []), by_fmpy(), by_libcosim(), by_ecos(True), by_ecos(False)]
-    took = dict(zip(names, per_step(makers, steps, 3), strict=True))
+    took = dict(zip(names, per_step(makers, [many, few, few, few, many]), strict=True))
     figures = {f"{name}.us_per_step": value for name, value in took.items()}
     return figures | {f"{name}_over_ours": took[name] / took["ours"] for name in names[1:]}
 
@@ -312,25 +317,34 @@ def driven(quick: bool) -> Figures:
 
     def wave(steps: int) -> np.ndarray:
         t = STEP * np.arange(steps + 1)
-        return np.array(list(zip(t, 12 * np.sin(2 * np.pi * t), strict=True)), dtype=[("time", float), ("v", float)])
+        return np.array(
+            list(zip(t, 12 * np.sin(2 * np.pi * t), strict=True)), dtype=[("time", float), ("v", float)]
+        )
 
-    mine, theirs = per_step([ours(make, [("drive.y", "plant.v")]), by_fmpy(wave)], 5_000 if quick else 50_000, 3)
-    return {"driven.us_per_step": mine, "driven.fmpy_us_per_step": theirs, "driven.fmpy_over_ours": theirs / mine}
+    mine, theirs = per_step(
+        [ours(make, [("drive.y", "plant.v")]), by_fmpy(wave)], 5_000 if quick else 50_000, 3
+    )
+    return {
+        "driven.us_per_step": mine,
+        "driven.fmpy_us_per_step": theirs,
+        "driven.fmpy_over_ours": theirs / mine,
+    }
 
 
 def files(quick: bool) -> Figures:
     """Rows of three columns onto the disk."""
     rows = 100_000 if quick else 1_000_000
-    frame = pd.DataFrame(np.random.default_rng(0).normal(size=(rows, 3)), columns=["time", "a.y", "b.y"])
+    values = np.random.default_rng(0).normal(size=(3, rows))
+    table = pa.table(list(values), names=["time", "a.y", "b.y"])
     with tempfile.TemporaryDirectory() as folder:
-        stem = Path(folder) / "t"
 
-        def seconds(forms: tuple[str, ...]) -> float:
+        def seconds(kind: Callable[..., Any]) -> float:
             began = time.process_time()
-            write_table(stem, frame, {}, forms)
+            with kind(Path(folder) / "t", table.schema) as write:
+                write(table)
             return 1e6 * (time.process_time() - began) / rows
 
-        csv, parquet = best([lambda: seconds(("csv",)), lambda: seconds(("parquet",))], 3)
+        csv, parquet = best([lambda: seconds(csv_file), lambda: seconds(parquet_file)], 3)
     return {"csv.us_per_row": csv, "parquet.us_per_row": parquet}
 
 

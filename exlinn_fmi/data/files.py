@@ -15,12 +15,13 @@ import json
 import math
 import os
 import secrets
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from exlinn_fmi.errors import DataError, StorageError
 
@@ -56,7 +57,10 @@ def whole(*paths: Path) -> Iterator[list[Path]]:
         for path, stand_in in zip(paths, stand_ins, strict=True):
             stand_in.replace(path)
     except OSError as error:
-        raise StorageError(_explain(_concerned(error, paths, stand_ins), error)) from error
+        first = error
+        while isinstance(first.__context__, OSError):  # what is closed after it may fail as well
+            first = first.__context__
+        raise StorageError(_explain(_concerned(first, paths, stand_ins), first)) from error
     finally:
         for stand_in in stand_ins:
             _discard(stand_in)
@@ -118,19 +122,60 @@ def write_table(stem: Path, frame: pd.DataFrame, units: Mapping[str, str]) -> li
         StorageError: one of the files could not be written; none is replaced then.
     """
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     columns = {str(name): _column(frame[name]) for name in frame.columns}
-    fields = [
-        pa.field(name, column.type, metadata={UNIT: units[name].encode()} if name in units else None)
-        for name, column in columns.items()
-    ]
-    table = pa.table(list(columns.values()), schema=pa.schema(fields))
+    schema = _schema({name: column.type for name, column in columns.items()}, units)
+    return _write_tables(stem, schema, [pa.table(list(columns.values()), schema=schema)])
+
+
+def write_rows(
+    stem: Path, names: Sequence[str], units: Mapping[str, str], blocks: Iterable[NDArray[np.float64]]
+) -> list[Path]:
+    """Write the files of `write_table` block by block, so that only one block is in memory at a time.
+
+    Args:
+        stem: path without suffix.
+        names: names of the columns.
+        units: unit by column name; columns without one may be left out.
+        blocks: rows (n, columns) in order.
+
+    Returns:
+        The paths of the three files.
+
+    Raises:
+        StorageError: one of the files could not be written; none is replaced then.
+    """
+    import pyarrow as pa
+
+    schema = _schema(dict.fromkeys(names, pa.float64()), units)
+    tables = (
+        pa.table([pa.array(np.ascontiguousarray(column)) for column in block.T], schema=schema)
+        for block in blocks
+    )
+    return _write_tables(stem, schema, tables)
+
+
+def _schema(types: Mapping[str, pa.DataType], units: Mapping[str, str]) -> pa.Schema:
+    """Arrow's description of a table, units inside."""
+    import pyarrow as pa
+
+    return pa.schema(
+        [
+            pa.field(name, kind, metadata={UNIT: units[name].encode()} if name in units else None)
+            for name, kind in types.items()
+        ]
+    )
+
+
+def _write_tables(stem: Path, schema: pa.Schema, tables: Iterable[pa.Table]) -> list[Path]:
+    """Write Arrow tables one after the other into the three files of a table."""
     paths = [_beside(stem, suffix) for suffix in (".csv", ".parquet", ".meta.json")]
     with whole(*paths) as files:
-        _write_csv(files[0], table)
-        pq.write_table(table, files[1], compression="zstd")
-        known = {name: units[name] for name in columns if name in units}
+        with csv_file(files[0], schema) as to_csv, parquet_file(files[1], schema) as to_parquet:
+            for table in tables:
+                to_csv(table)
+                to_parquet(table)
+        known = {f.name: f.metadata[UNIT].decode() for f in schema if f.metadata}
         files[2].write_text(json.dumps({"units": known}, indent=2, ensure_ascii=False) + "\n", "utf-8")
     return paths
 
@@ -187,19 +232,38 @@ def _column(series: pd.Series[Any]) -> pa.Array:
     return pa.array(["" if v is None or v != v else str(v) for v in values], pa.string())
 
 
-def _write_csv(file: Path, table: pa.Table) -> None:
-    """Write a table in the form that the head of this module describes."""
+@contextmanager
+def csv_file(file: Path, schema: pa.Schema) -> Iterator[Callable[[pa.Table], None]]:
+    """A CSV file in the form that the head of this module describes; gives what appends a table to it."""
     import pyarrow as pa
     import pyarrow.csv
 
-    for k, column in enumerate(table.columns):
-        if pa.types.is_boolean(column.type):
-            table = table.set_column(k, table.field(k).name, column.cast(pa.uint8()))
+    plain = [pa.field(f.name, pa.uint8() if pa.types.is_boolean(f.type) else f.type) for f in schema]
     header = io.StringIO()
-    csv.writer(header, lineterminator="\n").writerow(table.column_names)
-    with file.open("wb") as stream:
+    csv.writer(header, lineterminator="\n").writerow(schema.names)
+    options = pyarrow.csv.WriteOptions(include_header=False)
+    with _named(file), file.open("wb") as stream:
         stream.write(header.getvalue().encode("utf-8"))
-        pyarrow.csv.write_csv(table, stream, pyarrow.csv.WriteOptions(include_header=False))
+
+        def append(table: pa.Table) -> None:
+            with _named(file):
+                pyarrow.csv.write_csv(table.cast(pa.schema(plain)), stream, options)
+
+        yield append
+
+
+@contextmanager
+def parquet_file(file: Path, schema: pa.Schema) -> Iterator[Callable[[pa.Table], None]]:
+    """A Parquet file; gives what appends a table to it."""
+    import pyarrow.parquet as pq
+
+    with _named(file), pq.ParquetWriter(file, schema, compression="zstd") as writer:
+
+        def append(table: pa.Table) -> None:
+            with _named(file):
+                writer.write_table(table)
+
+        yield append
 
 
 def _read_csv(file: Path) -> pa.Table:
@@ -233,11 +297,19 @@ def _plain(value: object) -> object:
 
 def _flush(file: Path) -> None:
     """Have the system write a file out, which is when a full or broken disk is noticed at the latest."""
-    with file.open("rb+") as stream:
-        try:
-            os.fsync(stream.fileno())
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, str(file)) from error
+    with _named(file), file.open("rb+") as stream:
+        os.fsync(stream.fileno())
+
+
+@contextmanager
+def _named(file: Path) -> Iterator[None]:
+    """Errors of the system that do not say so are about this file."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(file)
+        raise
 
 
 def _discard(stand_in: Path) -> None:
