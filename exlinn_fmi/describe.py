@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from exlinn_fmi.components.base import Variable
 from exlinn_fmi.data.files import read_json
 from exlinn_fmi.errors import InputError
+
+if TYPE_CHECKING:
+    from exlinn_fmi.workspace import Run
 
 
 def describe(target: Path, overrides: Sequence[str] = ()) -> str:
@@ -67,9 +71,21 @@ def describe_scenario(file: Path, overrides: Sequence[str]) -> str:
         else:
             experiments = f"{len(learn.training)} training experiments, {len(learn.test)} tests"
             lines.append(f"learns {learn.plant} in {names}: {experiments}")
+    apart = [name for name in components if runs_apart(name, work)]
+    if apart:
+        lines.append(f"isolated, in processes of their own: {', '.join(apart)}")
     if components:
         lines.append(Graph(components, work.scenario.connection_list()).describe())
     return "\n".join(lines)
+
+
+def runs_apart(name: str, work: Run) -> bool:
+    """Whether a component is an FMU that runs in a process of its own."""
+    from exlinn_fmi.factory import is_isolated
+    from exlinn_fmi.scenario.schema import FmuComponent
+
+    spec = work.scenario.components[name]
+    return isinstance(spec, FmuComponent) and is_isolated(spec, work.scenario, work.loaded.folder)
 
 
 def describe_run(folder: Path) -> str:

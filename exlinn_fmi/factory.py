@@ -60,6 +60,11 @@ def build(name: str, scenario: Scenario, folder: Path, run_folder: Path) -> Comp
         InputError: the component cannot be made; the message says why.
     """
     spec = scenario.components[name]
+    if isinstance(spec, FmuComponent) and is_isolated(spec, scenario, folder):
+        from exlinn_fmi.components.isolated import isolated_fmu
+
+        memory = None if spec.memory is None else 1e6 * spec.memory
+        return isolated_fmu(name, folder / spec.fmu, spec.timeout, memory)
     if not isinstance(spec, NmpcComponent):
         return make(name, spec, folder, run_folder)
     from exlinn_fmi.control.controller import NmpcController
@@ -96,6 +101,11 @@ def make(name: str, spec: ComponentBase, folder: Path, run_folder: Path) -> Comp
     if isinstance(spec, PythonComponentSpec):
         return load_python_component(spec.python, name, spec.options, folder)
     raise TypeError(f"no component for {type(spec).__name__}")
+
+
+def is_isolated(spec: FmuComponent, scenario: Scenario, folder: Path) -> bool:
+    """Whether an FMU runs in a process of its own: as it says, else where the scenario does not trust it."""
+    return spec.isolate if spec.isolate is not None else not scenario.trusts(folder / spec.fmu, folder)
 
 
 def model_system(reference: str, folder: Path, run_folder: Path) -> LagrangianSystem:

@@ -27,6 +27,13 @@ def components(survey: Survey) -> Iterator[Finding]:
     yield (), "missing key 'components': what takes part, by name"
 
 
+def trusted(survey: Survey) -> Iterator[Finding]:
+    """Folders to trust that are not there."""
+    for k, place in enumerate(survey.scenario.trust):
+        if not (survey.folder / place).is_dir():
+            yield ("trust", k), f"there is no folder {place!r} in {survey.folder.as_posix()!r}"
+
+
 def connections(survey: Survey) -> Iterator[Finding]:
     """Ends that do not exist or do not fit, and targets that are driven twice."""
     driven: dict[str, str] = {}

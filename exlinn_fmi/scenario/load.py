@@ -32,6 +32,7 @@ __all__ = ["Inspect", "LoadedScenario", "json_schema", "load_scenario", "named_f
 
 CHECKS = (
     check_graph.components,
+    check_graph.trusted,
     check_graph.connections,
     check_graph.start_values,
     check_graph.steps,

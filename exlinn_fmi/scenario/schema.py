@@ -8,6 +8,7 @@ say have files of their own: `signals.py`, `control.py`, `learning.py`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag
@@ -44,6 +45,15 @@ class FmuComponent(ComponentBase):
     """A Functional Mock-up Unit, FMI 2.0 or 3.0 Co-Simulation."""
 
     fmu: str = Field(description="the .fmu file, relative to the scenario")
+    isolate: bool | None = Field(
+        None,
+        description="run it in a process of its own, where a crash or endless loop does no harm; if "
+        "not given, that is so for FMUs outside the scenario's folder and the folders of `trust`",
+    )
+    timeout: Positive = Field(60.0, description="longest time that a call may take [s], if it is isolated")
+    memory: Positive | None = Field(
+        None, description="most memory that it may take [MB], if it is isolated; all there is if not given"
+    )
 
 
 class PlantComponent(ComponentBase):
@@ -155,9 +165,22 @@ class Scenario(Spec):
     connections: dict[VariablePath, Paths] = Field(
         default_factory=dict, description="from: to, or from: [to, to], each component.variable"
     )
+    trust: list[str] = Field(
+        default_factory=list,
+        description="folders beside the scenario's own whose FMUs may run in this process, at full speed",
+    )
     learn: AnyLearn | None = Field(None, description="learn a model of one component, or of measured data")
     simulate: Simulate | None = Field(None, description="run the components together")
     metrics: Metrics = Field(default_factory=lambda: Metrics(), description="how the closed loop is judged")
+
+    def trusts(self, file: Path, folder: Path) -> bool:
+        """Whether a file lies in the scenario's folder or in one that it trusts.
+
+        Args:
+            file: the file.
+            folder: the scenario's folder.
+        """
+        return any(file.resolve().is_relative_to((folder / place).resolve()) for place in (".", *self.trust))
 
     def connection_list(self) -> list[tuple[str, str]]:
         """All connections as (from, to)."""

@@ -3,9 +3,13 @@
    dx/dt = u, y = gain u + x + trim, and one feed-through of each other type. A call that the state machine of
    FMI 2.0 does not allow in the present phase is an error. Calls are traced to the file PROBE_TRACE. From
    t = 0.5 s on, doStep returns FAULT (a fmi2Status) if that is defined, or y is NaN with FAULT_NAN; SET_STATUS
-   and GET_STATUS are returned by every set of reals and get. */
+   and GET_STATUS are returned by every set of reals and get. HARM is a statement that is executed in the function
+   HARM_IN (doStep from t = 0.5 s on): what the FMU does to the process that runs it. */
 
 #include <math.h>
+#include <pthread.h>
+#include <signal.h>
+#include <unistd.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -20,6 +24,12 @@
 #ifndef GET_STATUS
 #define GET_STATUS fmi2OK
 #endif
+#ifndef HARM
+#define HARM
+#define HARM_IN 0
+#endif
+enum { NOWHERE, INSTANTIATE, INITIALIZE, SET, GET, STEP, FREE };
+#define HARMED(place) do { if (HARM_IN == place) { HARM; } } while (0)
 #define EXPORT __attribute__((visibility("default")))
 
 enum { U, GAIN, X, Y, TRIM, REALS };
@@ -66,6 +76,20 @@ static void defaults(Probe* p) {
     p->phase = INSTANTIATED;
 }
 
+/* What HARM may call. */
+__attribute__((unused)) static int deeper(volatile char* p) {
+    volatile char space[4096];
+    space[0] = *p;
+    return deeper(space) + space[0];
+}
+
+__attribute__((unused)) static void swell(void) {
+    for (;;) {
+        char* p = malloc(1 << 24);
+        memset(p, 1, 1 << 24);
+    }
+}
+
 static void outputs(Probe* p) {
     double* r = p->s.real;
     r[Y] = r[GAIN] * r[U] + r[X] + r[TRIM];
@@ -88,6 +112,7 @@ EXPORT fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String 
                                      const fmi2CallbackFunctions* calls, fmi2Boolean visible, fmi2Boolean logging) {
     (void)resources; (void)visible; (void)logging;
     trace("Instantiate");
+    HARMED(INSTANTIATE);
 #ifdef REFUSE
     calls->logger(calls->componentEnvironment, name, fmi2Error, "logStatusError", "no licence for %s", guid);
     return NULL;
@@ -102,6 +127,7 @@ EXPORT fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String 
 
 EXPORT void fmi2FreeInstance(fmi2Component c) {
     Probe* p = c;
+    HARMED(FREE);
     trace(p->saved ? "FreeInstance with saved states" : "FreeInstance");
     p->calls.freeMemory(p);
 }
@@ -121,6 +147,7 @@ EXPORT fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean defined, fmi2
 EXPORT fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
     Probe* p = c;
     trace("EnterInitializationMode");
+    HARMED(INITIALIZE);
     if (p->phase != INSTANTIATED || !p->s.set_up) return fail(p, "EnterInitializationMode");
     p->phase = INITIALIZING;
     return fmi2OK;
@@ -154,6 +181,7 @@ static int settable(Probe* p, int exact, int in_run) {
 
 EXPORT fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Real values[]) {
     Probe* p = c;
+    if (p->s.time > 0.5 - 1e-9) HARMED(SET);
     for (size_t k = 0; k < n; k++) {
         if (!settable(p, vr[k] != Y, vr[k] == U || vr[k] == TRIM)) return fail(p, "SetReal");
         p->s.real[vr[k]] = values[k];
@@ -184,6 +212,7 @@ EXPORT fmi2Status fmi2SetBoolean(fmi2Component c, const fmi2ValueReference vr[],
     EXPORT fmi2Status fmi2Get##Name(fmi2Component c, const fmi2ValueReference vr[], size_t n, type values[]) { \
         Probe* p = c;                                                                                        \
         if (p->phase == INSTANTIATED) return fail(p, "Get" #Name);                                           \
+        if (p->s.time > 0.5 - 1e-9) HARMED(GET);                                                             \
         outputs(p);                                                                                          \
         for (size_t k = 0; k < n; k++) values[k] = p->s.member[vr[k]];                                       \
         return GET_STATUS;                                                                                   \
@@ -196,6 +225,7 @@ EXPORT fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolea
     Probe* p = c;
     if (p->phase != STEPPING || fabs(t - p->s.time) > 1e-9 || t + h > p->s.stop + 1e-9) return fail(p, "DoStep");
     if (p->saved && no_set_state) return fail(p, "DoStep without undo");
+    if (t + h > 0.5 - 1e-9) HARMED(STEP);
     if (FAULT != fmi2OK && t + h > 0.5 - 1e-9) {
         p->calls.logger(p->calls.componentEnvironment, p->name, FAULT, "logStatusError",
                         "the %s is hot at t = %g s", "bearing", t + h);
