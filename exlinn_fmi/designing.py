@@ -124,8 +124,8 @@ def _plant_learned(work: Run) -> LearnFromPlant:
 
 def _family(work: Run, learn: LearnFromPlant, truth: Mapping[str, float]) -> LagrangianSystem:
     """The model with the parameters to find, at the values known so far."""
+    from exlinn_fmi.learn.identify import Unknowns
     from exlinn_fmi.mechanics.family import family
-    from exlinn_fmi.mechanics.monomials import MonomialBasis
 
     component = work.scenario.components[learn.plant]
     ours = f"plant:{component.plant}" if isinstance(component, PlantComponent) else "learned"
@@ -142,11 +142,8 @@ def _family(work: Run, learn: LearnFromPlant, truth: Mapping[str, float]) -> Lag
     base = base.with_inputs({c.coordinate().input or "" for c in learn.coordinates})
     values = {p.name: p.value for p in base.parameters} | dict(truth)
     parameters = _parameters(work, learn, values, model == "learned")
-    terms = learn.identify
-    basis = MonomialBasis(
-        base.coordinates, tuple(terms.lagrangian.values()), tuple(terms.dissipation.values())
-    )
-    return family(base, basis, parameters)
+    unknowns = Unknowns.of(base.coordinates, learn.identify)
+    return family(base, unknowns.basis, parameters).bound(unknowns.known)
 
 
 def _parameters(
@@ -164,7 +161,7 @@ def _parameters(
         found = dict(zip(table["name"], table["identified"], strict=True))
     result = []
     for name in learn.identify.names:
-        known = found.get(name, float("nan")), true_value(name, stated)
+        known = found.get(name, float("nan")), learn.identify.known.get(name, true_value(name, stated))
         value = next((x for x in (known if learned else known[::-1]) if np.isfinite(x)), 0.0)
         if value == 0:
             raise InputError(

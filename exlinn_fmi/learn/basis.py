@@ -156,6 +156,7 @@ def _independent(basis: MonomialBasis, data: Dataset) -> MonomialBasis:
         middle + MARGIN * half * at[0],
         np.abs(v).max(axis=0) * at[1],
         np.abs(a).max(axis=0) * at[2],
+        basis.start,
     ).reshape(*shape, basis.size)
     power = columns * np.sqrt(np.mean(v**2, axis=0))[:, None]  # so that equations weigh alike
     flat = power.reshape(-1, basis.size)

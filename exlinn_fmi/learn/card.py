@@ -87,7 +87,7 @@ def report_card(
     noise = relative_noise(train)
     metrics |= {f"learn.noise_{name}": value for name, value in noise.items()}
     found, texts = None, {}
-    if (options.lagrangian or options.dissipation) and (objective != "auto" or max(noise.values()) > CLEAN):
+    if options.names and (objective != "auto" or max(noise.values()) > CLEAN):
         found, texts["identify.objective"] = estimate(train, options, truth, objective)
     found = found or identify(system, train, options, truth)
     terms = None

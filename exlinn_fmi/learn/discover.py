@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.errors import TrainingError
+from exlinn_fmi.learn.projection import solve
 from exlinn_fmi.learn.trajectory import Fit, Information, Segments, Shooting, cut, maximum_likelihood
 from exlinn_fmi.learn.weak import inverse_regression, weak_regression
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
@@ -81,8 +83,10 @@ def least_mass(basis: MonomialBasis, p: Float[Array, " P"], data: Dataset) -> fl
     return float(np.linalg.eigvalsh(mass / np.sqrt(np.outer(mean, mean))).min())
 
 
-def start(basis: MonomialBasis, data: Dataset, segments: Segments) -> Float[Array, " P"]:
-    """Coefficients to start from: of several linear solves with M ≻ 0, the one that predicts best.
+def start(
+    basis: MonomialBasis, data: Dataset, segments: Segments, known: Float[Array, " P"] | None = None
+) -> Float[Array, " P"]:
+    """Parameters to start from: of several linear solves with M ≻ 0, the one that predicts best.
 
     An equation without input is homogeneous, so that noise shrinks it: with many terms and much noise M is
     not positive definite, and a ridge or fewer terms are the better start.
@@ -91,20 +95,24 @@ def start(basis: MonomialBasis, data: Dataset, segments: Segments) -> Float[Arra
         basis: the family.
         data: trajectories.
         segments: the same, cut.
+        known: parameters that are held, NaN where they are to be found.
 
     Raises:
         TrainingError: none of them predicts anything.
     """
     orders = np.array([_order(text, basis) for text in basis.terms])
     shooting = Shooting(basis.system(), segments)
-    best, least = np.zeros(basis.size), float("inf")
-    for make in (weak_regression, inverse_regression):
-        regression = make(basis, data)
+    best, least = np.zeros(len(basis.start)), float("inf")
+    held = np.full(len(best), np.nan) if known is None else known
+    for kind in (weak_regression, inverse_regression):
+        at = solve(partial(kind, basis, data), basis.start, held)
+        regression = kind(basis, data, at)
         for highest in (*ORDERS, int(orders.max())):
             chosen = orders <= highest
             for ridge in RIDGES if highest == orders.max() else RIDGES[:1]:
-                part = regression._replace(columns=regression.columns[:, :, chosen])
-                p = spread(part.solve(ridge), chosen)
+                # Terms that do not take part are known to be 0.
+                out = np.where(chosen, held[: basis.size], 0.0)
+                p = np.concatenate([regression.solve(ridge, out), at[basis.size :]])
                 if least_mass(basis, p, data) > LEAST_MASS and (error := shooting.misprediction(p)) < least:
                     best, least = p, error
     if not np.isfinite(least):

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.errors import TrainingError
-from exlinn_fmi.learn.discover import start
-from exlinn_fmi.learn.identify import PART, Identified, parameter_table
+from exlinn_fmi.learn.discover import spread, start
+from exlinn_fmi.learn.identify import Identified, Unknowns, parameter_table
 from exlinn_fmi.learn.noise import CLEAN
 from exlinn_fmi.learn.terms import choose, linear_fit, regress
 from exlinn_fmi.learn.trajectory import Fit, cut, maximum_likelihood
-from exlinn_fmi.mechanics.monomials import MonomialBasis
 from exlinn_fmi.scenario.learning import Identify, Objective
 
 Array = NDArray[np.float64]
@@ -57,16 +56,16 @@ def estimate(data: Dataset, options: Identify, truth: Mapping[str, float], objec
     Raises:
         ModelError: a monomial cannot be read.
     """
-    names = [*options.lagrangian, *options.dissipation]
-    basis = MonomialBasis(
-        data.coordinates, tuple(options.lagrangian.values()), tuple(options.dissipation.values())
-    )
+    unknowns = Unknowns.of(data.coordinates, options)
+    basis, known = unknowns.basis, unknowns.known
     chosen, why = choose(objective, basis, data)
     if chosen == "trajectory":
-        system = basis.system()
+        system, free = basis.system().bound(known), np.isnan(known)
         segments = cut(data, system.state_names, system.input_names)
         try:
-            fit = maximum_likelihood(system, segments, start(basis, data, segments))
+            found = start(basis, data, segments, known)
+            fit = maximum_likelihood(system, segments, found[free])
+            fit = fit._replace(p=np.where(free, spread(fit.p, free), known))
         except TrainingError:
             return Estimate(None, "read off the learned model: the monomials alone predict nothing")
         size = data.frame[system.state_names].std().to_numpy()
@@ -76,19 +75,20 @@ def estimate(data: Dataset, options: Identify, truth: Mapping[str, float], objec
             return Estimate(None, f"read off the learned model: {reason}")
         misfit = float((fit.sigma / size).max())
     else:
-        regression, windows = regress(basis, data, chosen)
-        fit = linear_fit(regression, windows)
-        misfit = regression.misfit(fit.p)
-    unknown = np.abs(fit.information.unknown) > PART
-    lost = np.asarray(unknown.any(axis=0))
-    groups = [" and ".join(np.array(names)[row]) for row in unknown]
-    doubt = "".join(f"; not identifiable apart from these data: {group}" for group in groups)
-    return Estimate(Identified(_table(names, fit, lost, truth), misfit), why + doubt)
+        make, windows = regress(basis, data, chosen)
+        fit = linear_fit(make, basis.start, windows, known=known)
+        misfit = make(fit.p).misfit(fit.p)
+    lost, groups = unknowns.lost(fit.information)
+    told = "".join(f"; not identifiable apart from these data: {group}" for group in groups)
+    held = ", ".join(f"{n} = {x:g}" for n, x in zip(unknowns.names, known, strict=True) if np.isfinite(x))
+    told += f"; held: {held}" if held else ""
+    return Estimate(Identified(_table(unknowns, fit, lost, truth), misfit), why + told)
 
 
-def _table(names: list[str], fit: Fit, lost: NDArray[np.bool_], truth: Mapping[str, float]) -> pd.DataFrame:
+def _table(unknowns: Unknowns, fit: Fit, lost: NDArray[np.bool_], truth: Mapping[str, float]) -> pd.DataFrame:
     """Parameters beside their true values, with deviations and 95 % intervals."""
     values = np.where(lost, np.nan, fit.p)
-    std = np.where(lost, np.nan, np.sqrt(np.maximum(np.diag(fit.information.covariance), 0)))
-    table = parameter_table(names, values, truth)
+    deviation = np.sqrt(np.maximum(np.diag(fit.information.covariance), 0))
+    std = np.where(lost, np.nan, spread(deviation, np.isnan(unknowns.known)))
+    table = parameter_table(unknowns.names, values, truth)
     return table.assign(std=std, low=values - CONFIDENCE * std, high=values + CONFIDENCE * std)

@@ -18,13 +18,15 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.errors import ModelError
+from exlinn_fmi.learn.terms import linear_fit
+from exlinn_fmi.learn.trajectory import Information
+from exlinn_fmi.learn.weak import Regression
+from exlinn_fmi.mechanics.coordinates import Coordinate, Parameter
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
 from exlinn_fmi.mechanics.monomials import MonomialBasis, parse_monomial
 from exlinn_fmi.scenario.learning import Identify
 
 SAMPLES = 2000
-SINGULAR = 1e-8
-"""Singular values below this share of the largest tell that parameters cannot be told apart."""
 PART = 1e-4
 """A parameter that takes part in a singular direction with more than this is not identifiable."""
 
@@ -43,6 +45,44 @@ class Identified(NamedTuple):
     misfit: float
 
 
+class Unknowns(NamedTuple):
+    """What the user wants to know: the family, and which of its parameters are known already.
+
+    Args:
+        basis: monomials and shapes.
+        names: of all parameters.
+        known: values of those that are held, NaN for the others.
+    """
+
+    basis: MonomialBasis
+    names: list[str]
+    known: Float[Array, " P"]
+
+    @classmethod
+    def of(cls, coordinates: tuple[Coordinate, ...], options: Identify) -> Unknowns:
+        """From the `identify` section.
+
+        Raises:
+            ModelError: a monomial cannot be read.
+        """
+        basis = MonomialBasis(
+            coordinates,
+            tuple(options.lagrangian.values()),
+            tuple(options.dissipation.values()),
+            tuple(Parameter(name, value, "") for name, value in options.shapes.items()),
+        )
+        known = [options.known.get(name, np.nan) for name in options.names]
+        return cls(basis, options.names, np.array(known, dtype=float))
+
+    def lost(self, information: Information) -> tuple[Bool[NDArray[np.bool_], " P"], list[str]]:
+        """Parameters that the data do not tell, and in words what cannot be told apart."""
+        free = np.flatnonzero(np.isnan(self.known))
+        unknown = np.abs(information.unknown) > PART
+        lost = np.zeros(len(self.names), dtype=bool)
+        lost[free[unknown.any(axis=0)]] = True
+        return lost, [" and ".join(np.array(self.names)[free[row]]) for row in unknown]
+
+
 def identify(
     system: LagrangianSystem, data: Dataset, options: Identify, truth: Mapping[str, float], seed: int = 0
 ) -> Identified:
@@ -58,12 +98,10 @@ def identify(
     Raises:
         ModelError: a monomial cannot be read.
     """
-    names = [*options.lagrangian, *options.dissipation]
-    if not names:
+    if not options.names:
         return Identified(parameter_table([], np.empty(0), truth), float("nan"))
-    basis = MonomialBasis(
-        system.coordinates, tuple(options.lagrangian.values()), tuple(options.dissipation.values())
-    )
+    unknowns = Unknowns.of(system.coordinates, options)
+    basis = unknowns.basis
     samples = data.arrays
     random = np.random.default_rng(seed)
     rows = np.linspace(0, len(data) - 1, min(len(data), SAMPLES)).astype(int)
@@ -71,23 +109,15 @@ def identify(
     a = np.abs(samples.a).max(axis=0) * random.uniform(-1, 1, v.shape)
     force = evaluate(system.inverse, q, v, a, np.zeros(0))
     weight = 1 / np.maximum(np.sqrt(np.mean(force**2, axis=0)), np.finfo(float).tiny)
-    matrix = evaluate(basis.regressor(), q, v, a).reshape(*v.shape, len(names)) * weight[:, None]
-    values, misfit = _solve(matrix.reshape(-1, len(names)), (force * weight).ravel())
-    return Identified(parameter_table(names, values, truth), misfit)
 
+    def make(p: Float[Array, " P"]) -> Regression:
+        columns = evaluate(basis.regressor(), q, v, a, p).reshape(*v.shape, len(p))
+        return Regression(columns * weight[:, None], force * weight, basis.size)
 
-def _solve(matrix: Float[Array, "N K"], right: Float[Array, " N"]) -> tuple[Float[Array, " K"], float]:
-    """Least squares with NaN for what is not determined, and the relative misfit."""
-    size = np.linalg.norm(matrix, axis=0)
-    seen = size > 0
-    left, singular, directions = np.linalg.svd(matrix[:, seen] / size[seen], full_matrices=False)
-    strong = singular > SINGULAR * singular.max(initial=0.0)
-    solution = directions[strong].T @ ((left[:, strong].T @ right) / singular[strong])
-    lost: Bool[NDArray[np.bool_], " k"] = (np.abs(directions[~strong]) > PART).any(axis=0)
-    values = np.full(len(size), np.nan)
-    values[seen] = np.where(lost, np.nan, solution / size[seen])
-    rest = right - (matrix[:, seen] / size[seen]) @ solution
-    return values, float(np.linalg.norm(rest) / np.linalg.norm(right))
+    fit = linear_fit(make, basis.start, 1, known=unknowns.known)
+    lost, _ = unknowns.lost(fit.information)
+    table = parameter_table(unknowns.names, np.where(lost, np.nan, fit.p), truth)
+    return Identified(table, make(fit.p).misfit(fit.p))
 
 
 def parameter_table(names: list[str], values: Float[Array, " K"], truth: Mapping[str, float]) -> pd.DataFrame:

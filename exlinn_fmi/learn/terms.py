@@ -7,8 +7,9 @@ deviation, which goes into the model's provenance.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from exlinn_fmi.learn.basis import entry, generic_basis
 from exlinn_fmi.learn.discover import Discovery, discover, least_mass, prune, spread
 from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.learn.noise import CLEAN, relative_noise
+from exlinn_fmi.learn.projection import Make, solve
 from exlinn_fmi.learn.trajectory import Fit, Information, Shooting, cut, even
 from exlinn_fmi.learn.weak import OVERLAP, Regression, inverse_regression, weak_regression
 from exlinn_fmi.mechanics.learned import ModelSpec
@@ -76,16 +78,20 @@ def choose(objective: Objective, basis: MonomialBasis, data: Dataset) -> tuple[O
             "trajectory",
             f"trajectory: {worst} has {100 * noise[worst]:.2g} % noise, the most of all states",
         )
-    regression = inverse_regression(basis, data)
-    misfit = regression.misfit(regression.solve())
-    weak = weak_regression(basis, data)
+    misfit = _misfit(inverse_regression, basis, data)
     # Where neither fits it is the terms that fall short: no objective mends that.
-    if misfit > CONSISTENT and weak.misfit(weak.solve()) < BETTER * misfit:
+    if misfit > CONSISTENT and _misfit(weak_regression, basis, data) < BETTER * misfit:
         return (
             "trajectory",
             f"trajectory: states are clean, but {100 * misfit:.2g} % of forces do not fit the accelerations",
         )
     return "inverse", "inverse: the states are clean and the accelerations do not contradict them"
+
+
+def _misfit(kind: Callable[..., Regression], basis: MonomialBasis, data: Dataset) -> float:
+    """What the best of a family leaves unexplained."""
+    p = solve(partial(kind, basis, data), basis.start)
+    return kind(basis, data, p).misfit(p)
 
 
 def iterate_terms(
@@ -118,35 +124,48 @@ def iterate_terms(
 
 def _least_squares(basis: MonomialBasis, data: Dataset, objective: Objective) -> Iterator[Discovery]:
     """Least squares on all terms, and on those that pruning leaves."""
-    regression, windows = regress(basis, data, objective)
-    chosen = np.ones(basis.size, dtype=bool)
-    fit = linear_fit(regression, windows, LEAST_MISFIT)
+    make, windows = regress(basis, data, objective)
+    chosen, regression = np.ones(basis.size, dtype=bool), make(basis.start)
+    fit = linear_fit(make, basis.start, windows, LEAST_MISFIT)
     yield Discovery("all terms", chosen, fit)
     chosen = prune(fit, regression.force.size / windows, basis.size)
-    part = Regression(regression.columns[:, :, chosen], regression.force)
-    yield Discovery("least squares", chosen, linear_fit(part, windows))
+    part = regression.only(chosen)
+    yield Discovery("least squares", chosen, linear_fit(lambda p: part, basis.start[chosen], windows))
 
 
-def regress(basis: MonomialBasis, data: Dataset, objective: Objective) -> tuple[Regression, int]:
-    """The linear problem of ``inverse`` or ``weak``, and how many rows share samples, and so count as one."""
+def regress(basis: MonomialBasis, data: Dataset, objective: Objective) -> tuple[Make, int]:
+    """The problem of ``inverse`` or ``weak``, and how many rows share samples, and so count as one."""
     if objective == "weak":
-        return weak_regression(basis, data), OVERLAP
-    return inverse_regression(basis, data), 1
+        return partial(weak_regression, basis, data), OVERLAP
+    return partial(inverse_regression, basis, data), 1
 
 
-def linear_fit(regression: Regression, windows: int, least: float = 0.0) -> Fit:
+def linear_fit(
+    make: Make,
+    start: Float[Array, " P"],
+    windows: int,
+    least: float = 0.0,
+    known: Float[Array, " P"] | None = None,
+) -> Fit:
     """Least squares with covariance from its residuals.
 
     Args:
-        regression: the linear problem.
+        make: the problem at given shapes.
+        start: where shapes are looked for.
         windows: how many of its rows count as one.
         least: smallest noise of the forces, as a share of their size.
+        known: parameters that are held, NaN where they are to be found.
+
+    Returns:
+        All parameters; the information is on those that were to be found.
     """
-    p = regression.solve()
-    flat = regression.columns.reshape(-1, len(p))
+    p = solve(make, start, known)
+    regression = make(p)
+    free = np.ones(len(p), dtype=bool) if known is None else np.isnan(known)
+    flat = regression.columns.reshape(-1, len(p))[:, free]
     force = np.sqrt(np.mean(regression.force**2))
     sigma = max(regression.misfit(p), least, np.finfo(float).eps) * force
-    value = float(np.sum((flat @ p - regression.force.ravel()) ** 2) / sigma**2)
+    value = float(np.sum(regression.residual(p) ** 2) / sigma**2)
     return Fit(p, np.zeros((0, 0)), value, Information(flat.T @ flat / (windows * sigma**2)), np.zeros(0))
 
 

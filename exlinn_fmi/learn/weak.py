@@ -35,52 +35,91 @@ CUT = 1e-12
 
 
 class Regression(NamedTuple):
-    """F = columns · p for each row and equation, forces relative to their scale."""
+    """F = columns · p for each row and equation, forces relative to their scale.
+
+    Args:
+        columns: derivatives of the forces by the parameters: by the coefficients, in which the forces are
+            linear, then by the shapes.
+        force: generalised forces.
+        terms: number of coefficients.
+    """
 
     columns: Float[Array, "R n P"]
     force: Float[Array, "R n"]
+    terms: int
 
-    def solve(self, ridge: float = 0.0) -> Float[Array, " P"]:
-        """Least squares with columns scaled to one.
+    def solve(self, ridge: float = 0.0, known: Float[Array, " T"] | None = None) -> Float[Array, " T"]:
+        """Coefficients by least squares with columns scaled to one.
 
         Args:
             ridge: weight of ‖p‖² in that scale.
+            known: coefficients that are held, NaN where they are to be found.
         """
-        size = np.linalg.norm(self.columns, axis=(0, 1))
+        p = np.full(self.terms, np.nan) if known is None else known[: self.terms].copy()
+        free = np.isnan(p)
+        p[free] = 0
+        columns, right = self.columns[:, :, : self.terms][:, :, free], self.residual(p)
+        size = np.linalg.norm(columns, axis=(0, 1))
         size[size == 0] = 1
-        matrix = (self.columns / size).reshape(self.force.size, len(size))
-        right = self.force.ravel()
+        matrix, right = (columns / size).reshape(right.size, len(size)), -right.ravel()
         if ridge:
             matrix = np.vstack([matrix, np.sqrt(ridge) * np.eye(len(size))])
             right = np.concatenate([right, np.zeros(len(size))])
-        return np.asarray(np.linalg.lstsq(matrix, right, rcond=CUT)[0] / size)
+        p[free] = np.linalg.lstsq(matrix, right, rcond=CUT)[0] / size
+        return p
+
+    def only(self, chosen: NDArray[np.bool_]) -> Regression:
+        """The regression of some of the parameters.
+
+        Args:
+            chosen: which, shapes included.
+        """
+        return Regression(self.columns[:, :, chosen], self.force, int(chosen[: self.terms].sum()))
+
+    def residual(self, p: Float[Array, " P"]) -> Float[Array, "R n"]:
+        """Forces of the model less those in the data; shapes in p are those of the columns."""
+        return np.asarray(self.columns[:, :, : self.terms] @ p[: self.terms] - self.force)
 
     def misfit(self, p: Float[Array, " P"]) -> float:
         """What is left unexplained, as a share of the forces."""
-        return float(np.linalg.norm(self.columns @ p - self.force) / np.linalg.norm(self.force))
+        return float(np.linalg.norm(self.residual(p)) / np.linalg.norm(self.force))
 
 
-def inverse_regression(basis: MonomialBasis, data: Dataset) -> Regression:
-    """The inverse model (17) at the samples, accelerations as they stand in the data."""
+def inverse_regression(
+    basis: MonomialBasis, data: Dataset, p: Float[Array, " P"] | None = None
+) -> Regression:
+    """The inverse model (17) at the samples, accelerations as they stand in the data.
+
+    Args:
+        basis: the family.
+        data: the samples.
+        p: where its columns are taken, if it has shapes; at its start if not given.
+    """
     q, v, a, force = data.arrays
-    scale = force_scale(data)
-    columns = evaluate(basis.regressor(), q, v, a).reshape(*v.shape, basis.size)
-    return Regression(columns / scale[:, None], force / scale)
+    scale, p = force_scale(data), basis.start if p is None else p
+    columns = evaluate(basis.regressor(), q, v, a, p).reshape(*v.shape, len(p))
+    return Regression(columns / scale[:, None], force / scale, basis.size)
 
 
-def weak_regression(basis: MonomialBasis, data: Dataset) -> Regression:
-    """The equations against test functions, in windows that overlap."""
-    scale = force_scale(data)
+def weak_regression(basis: MonomialBasis, data: Dataset, p: Float[Array, " P"] | None = None) -> Regression:
+    """The equations against test functions, in windows that overlap.
+
+    Args:
+        basis: the family.
+        data: trajectories.
+        p: where its columns are taken, if it has shapes; at its start if not given.
+    """
+    scale, at = force_scale(data), basis.start if p is None else p
     momenta, rest = basis.momenta(), basis.rest()
     q, v, _, force = data.arrays
     columns, forces = [], []
     for rows, phi, slope, held in _windows(data):
-        shape = (len(rows), v.shape[1], basis.size)
-        p = evaluate(momenta, q[rows], v[rows]).reshape(shape)
-        r = evaluate(rest, q[rows], v[rows]).reshape(shape)
-        columns.append(np.tensordot(phi, r, axes=(1, 0)) - np.tensordot(slope, p, axes=(1, 0)))
+        shape = (len(rows), v.shape[1], len(at))
+        m = evaluate(momenta, q[rows], v[rows], at).reshape(shape)
+        r = evaluate(rest, q[rows], v[rows], at).reshape(shape)
+        columns.append(np.tensordot(phi, r, axes=(1, 0)) - np.tensordot(slope, m, axes=(1, 0)))
         forces.append(held @ force[rows])
-    return Regression(np.concatenate(columns) / scale[:, None], np.concatenate(forces) / scale)
+    return Regression(np.concatenate(columns) / scale[:, None], np.concatenate(forces) / scale, basis.size)
 
 
 def force_scale(data: Dataset) -> Float[Array, " n"]:

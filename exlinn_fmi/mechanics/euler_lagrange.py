@@ -118,16 +118,22 @@ class LagrangianSystem:
         return replace(self, coordinates=coordinates)
 
     def bound(self, values: ArrayLike) -> LagrangianSystem:
-        """The same system with its parameters fixed: one that has none.
+        """The same system with its parameters fixed, or some of them.
 
         Args:
-            values: of the parameters, shape (r,).
+            values: of the parameters, shape (r,); NaN where one stays a parameter.
         """
-        p = ca.DM(np.asarray(values, dtype=float))
+        fixed = np.asarray(values, dtype=float)
+        free = np.flatnonzero(np.isnan(fixed)).tolist()
+
+        def full(p: Symbol) -> Symbol:
+            return ca.vertcat(*(p[free.index(k)] if k in free else fixed[k] for k in range(len(fixed))))
+
         return LagrangianSystem.build(
             self.coordinates,
-            lambda q, v, none: self.lagrangian(q, v, p),
-            lambda v, none: self.dissipation(v, p),
+            lambda q, v, p: self.lagrangian(q, v, full(p)),
+            lambda v, p: self.dissipation(v, full(p)),
+            tuple(self.parameters[k] for k in free),
         )
 
     def loaded(self) -> LagrangianSystem:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from exlinn_fmi.components.base import Variable
@@ -193,15 +194,53 @@ def _experiment(at: KeyPath, experiment: Experiment, plant: str | None, survey: 
 
 def _monomials(learn: AnyLearn, coordinates: tuple[Coordinate, ...]) -> Iterator[Finding]:
     """Features and terms that cannot be read, or that name what the model does not have."""
-    if not coordinates:
-        return
+    method, identify = learn.method, learn.identify
+    inside = {"identify": identify.shapes, "method": method.shapes if isinstance(method, Terms) else {}}
+    texts: dict[str, list[str]] = {"identify": [], "method": []}
+    for at, text in _terms(method, identify):
+        texts[str(at[1])].append(text)
+        if coordinates:
+            yield from _monomial(at, text, coordinates, inside[str(at[1])])
+    for section, shapes in inside.items():
+        yield from _shapes(("learn", section), shapes, texts[section])
+    candidates = [*texts["method"], *inside["method"]]
+    for section, names in (("identify", identify.names), ("method", candidates)):
+        for name in getattr(getattr(learn, section), "known", {}):
+            if name not in names:
+                message = f"{name!r} is not among the parameters{suggestion(name, names, 'they')}"
+                yield ("learn", section, "known", name), message
+    for name in sorted({name for name in identify.names if identify.names.count(name) > 1}):
+        yield ("learn", "identify"), f"{name!r} is the name of two parameters; rename one of them"
+
+
+def _monomial(
+    at: KeyPath, text: str, coordinates: tuple[Coordinate, ...], shapes: Mapping[str, float]
+) -> Iterator[Finding]:
+    """A monomial that cannot be read, or that takes degrees for radians."""
+    from exlinn_fmi.mechanics.learned import TURN, angular
     from exlinn_fmi.mechanics.monomials import parse_term
 
-    for at, text in _terms(learn.method, learn.identify):
-        try:
-            parse_term(text, coordinates, dissipation="dissipation" in str(at[2]))
-        except ModelError as error:
-            yield at, str(error)
+    try:
+        monomial = parse_term(text, coordinates, "dissipation" in str(at[2]), shapes)
+    except ModelError as error:
+        yield at, str(error)
+        return
+    angles = {c.name: c for c in coordinates if c.unit in TURN and c.unit != "rad"}
+    for factor in monomial.factors:
+        if factor.function in ("sin", "cos") and factor.name in angles and factor.scale == 1:
+            c, call = angles[factor.name], f"{factor.function}({factor.name})"
+            fix = f"{factor.function}({angular(c):.17g}*{c.name})"
+            yield at, f"{call} takes its argument in rad, and {c.name} is in {c.unit}; write {fix}"
+
+
+def _shapes(at: KeyPath, shapes: Mapping[str, float], texts: Iterable[str]) -> Iterator[Finding]:
+    """Shapes that no monomial has, or that cannot be looked for from where they start."""
+    used = {word for text in texts for word in re.findall(r"[A-Za-z_]\w*", text)}
+    for name, value in shapes.items():
+        if name not in used:
+            yield (*at, "shapes", name), f"no monomial holds {name!r}; write e.g. `{name}*logcosh(v/{name})`"
+        if not (math.isfinite(value) and value != 0):
+            yield (*at, "shapes", name), f"expected a start of the right sign and size, found {value:g}"
 
 
 def _terms(method: Structured | Terms | Paper, identify: Identify) -> Iterator[tuple[KeyPath, str]]:

@@ -184,6 +184,13 @@ class Terms(Spec):
     dissipation: list[str] = Field(
         default_factory=list, description="candidates for D; none are used where only those for 𝓛 are given"
     )
+    shapes: dict[str, float] = Field(
+        default_factory=dict,
+        description="parameters inside functions of the candidates and where they are looked for",
+    )
+    known: dict[str, float] = Field(
+        default_factory=dict, description="candidates whose coefficients are known and held"
+    )
 
 
 class Paper(Spec):
@@ -220,11 +227,19 @@ class Identify(Spec):
     dissipation: dict[str, str] = Field(
         default_factory=dict, description="parameter: monomial of D, e.g. r: 0.5*i^2"
     )
+    shapes: dict[str, float] = Field(
+        default_factory=dict,
+        description="parameters inside functions and where they are looked for, e.g. s: 0.1 for "
+        "tau_c: s*logcosh(phi_dot/s)",
+    )
+    known: dict[str, float] = Field(
+        default_factory=dict, description="values of parameters that are known and held, e.g. l: 0.02"
+    )
 
     @property
     def names(self) -> list[str]:
-        """All parameters, those of 𝓛 first."""
-        return [*self.lagrangian, *self.dissipation]
+        """All parameters, those of 𝓛 first, shapes last."""
+        return [*self.lagrangian, *self.dissipation, *self.shapes]
 
 
 class EnergiesSpec(Spec):

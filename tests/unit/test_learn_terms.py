@@ -60,7 +60,7 @@ def test_no_direction_of_the_generic_terms_is_a_gauge(make) -> None:
     basis = generic_basis(make())
     random, n = np.random.default_rng(3), len(basis.coordinates)
     at = random.uniform(-1, 1, (3, 400, n)) * np.abs([x.max(axis=0) + 1 for x in make().arrays[:3]])[:, None]
-    columns = evaluate(basis.regressor(), *at).reshape(-1, basis.size)
+    columns = evaluate(basis.regressor(), *at, basis.start).reshape(-1, basis.size)
     singular = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), compute_uv=False)
     assert singular[-1] > 1e-4
 
