@@ -2,9 +2,9 @@
 
 𝓛 = ½ q̇ᵀM(q)q̇ + (Kq + A(q))ᵀq̇ − V(q), M apart for mechanical and electrical coordinates; each entry is a
 sum of functions of position: powers of sine and cosine on a circle (the span of the Fourier series to the
-third harmonic), Chebyshev's polynomials on a line, their products for several. D has viscous, Coulomb and
-quadratic friction for each velocity. Terms that the equations of motion cannot tell from earlier ones
-(gauges) are left out, the simpler ones standing first.
+third harmonic), powers and rational functions of a shape on a line, their products for several. D has
+viscous, Coulomb and quadratic friction for each velocity where not known otherwise. Terms that the equations
+of motion cannot tell from earlier ones (gauges) are left out, the simpler ones standing first.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ import re
 from itertools import combinations, combinations_with_replacement
 
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
-from exlinn_fmi.mechanics.coordinates import Coordinate
+from exlinn_fmi.mechanics.coordinates import Coordinate, Parameter
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
 from exlinn_fmi.mechanics.learned import angular
 from exlinn_fmi.mechanics.monomials import Factor, MonomialBasis, parse_term
@@ -34,8 +33,16 @@ CIRCLE = (
     ("sin({0})^2*cos({0})", 3),
 )
 """Functions on a circle and their orders."""
-CHEBYSHEV = 6
-"""Highest degree on a line."""
+POWERS = 6
+"""Highest power on a line."""
+RATIONAL = ("lorentz({x}/a_{x})", "hyperbola({x}/h_{x})")
+"""Functions on a line beside its powers: inductances and capacitances mostly have such a form."""
+DEGREES = (2, 3, 4, 6)
+"""Degrees on lines of the families that are tried one after the other."""
+RATIONAL_ORDER = 3
+"""They count as of this order."""
+POLE = 3.0
+"""Hyperbolas are looked for with their pole so many times the reach of the data away."""
 MARGIN = 1.1
 """A line is covered a little beyond the data."""
 PRODUCTS = 3
@@ -57,19 +64,32 @@ def generic_basis(data: Dataset, structure: Structure = UNKNOWN) -> MonomialBasi
         data: what it is to explain.
         structure: what is known of the plant: terms that it cannot have are left out.
     """
-    samples, coordinates = data.arrays, data.coordinates
+    coordinates = data.coordinates
     lagrangian = [
         term
-        for function, _ in position_functions(coordinates, samples.q)
+        for function, _ in position_functions(coordinates)
         for term in _terms_with(function, coordinates, structure)
     ]
     lagrangian += [c.name for i, c in enumerate(coordinates) if structure.has_offset(i)]
-    dissipation = []
-    for i, rms in enumerate(np.sqrt(np.mean(samples.v**2, axis=0)).tolist()):
-        kinds = structure.friction_of(i, FRICTION)
-        dissipation += [_friction(kind, coordinates[i].velocity, rms) for kind in kinds]
-    dissipation.sort(key=lambda text: text not in [f"0.5*{c.velocity}^2" for c in coordinates])
-    return _independent(MonomialBasis(coordinates, tuple(lagrangian), tuple(dissipation)), data)
+    kinds = [structure.friction_of(i, FRICTION) for i in range(len(coordinates))]
+    dissipation = [
+        _friction(kind, c.velocity)
+        for kind in FRICTION_TERMS
+        for c, known in zip(coordinates, kinds, strict=True)
+        if kind in known
+    ]
+    basis = MonomialBasis(coordinates, tuple(lagrangian), tuple(dissipation), _shapes(data))
+    return _independent(basis.only(np.ones(basis.size, dtype=bool)), data)
+
+
+def _shapes(data: Dataset) -> tuple[Parameter, ...]:
+    """Shapes that generic terms may hold: velocities of friction, lengths of rational functions."""
+    shapes, samples = [], data.arrays
+    for c, v, q in zip(data.coordinates, samples.v.T, samples.q.T, strict=True):
+        rms, reach = float(np.sqrt(np.mean(v**2))), float(np.abs(q).max()) or 1.0
+        shapes += [(f"s_{c.velocity}", COULOMB * rms), (f"w_{c.velocity}", COULOMB * rms)]
+        shapes += [(f"a_{c.name}", reach), (f"h_{c.name}", POLE * reach)]
+    return tuple(Parameter(name, value, "") for name, value in shapes)
 
 
 def _terms_with(function: str, coordinates: tuple[Coordinate, ...], structure: Structure) -> list[str]:
@@ -96,40 +116,70 @@ def _terms_with(function: str, coordinates: tuple[Coordinate, ...], structure: S
     ]
 
 
-def _friction(kind: Friction, velocity: str, rms: float) -> str:
-    """A term of D; Coulomb's changes its sign, and Stribeck's peaks, at a share of the rms velocity."""
-    width = COULOMB * rms
-    return {
-        "viscous": f"0.5*{velocity}^2",
-        "coulomb": f"{width:.6g}*logcosh({1 / width:.6g}*{velocity})",
-        "stribeck": f"{width:.6g}*stribeck({1 / width:.6g}*{velocity})",
-        "quadratic": f"{1 / 3:.12g}*abs({velocity})^3",
-    }[kind]
+FRICTION_TERMS: dict[Friction, str] = {
+    "viscous": "0.5*{v}^2",
+    "coulomb": "s_{v}*logcosh({v}/s_{v})",
+    "quadratic": f"{1 / 3:.12g}*abs({{v}})^3",
+    "stribeck": "w_{v}*stribeck({v}/w_{v})",
+}
+"""Terms of D; Coulomb's changes its sign within, and Stribeck's peaks at, a shape that is found."""
 
 
-def position_functions(coordinates: tuple[Coordinate, ...], q: Float[Array, "N n"]) -> list[tuple[str, int]]:
+def _friction(kind: Friction, velocity: str) -> str:
+    return FRICTION_TERMS[kind].format(v=velocity)
+
+
+def position_functions(coordinates: tuple[Coordinate, ...]) -> list[tuple[str, int]]:
     """Functions of position as text, and their orders; the constant is the empty text of order 0.
 
     Args:
         coordinates: the generalised coordinates.
-        q: positions that the functions cover.
     """
     each = []
-    for c, values in zip(coordinates, q.T, strict=True):
+    for c in coordinates:
         if c.topology == "circle":
             factor = angular(c)
             argument = c.name if factor == 1 else f"{factor:.17g}*{c.name}"
             each.append([(text.format(argument), order) for text, order in CIRCLE])
         elif c.topology == "line":
-            low, high = float(values.min()), float(values.max())
-            reach = MARGIN * (high - low) / 2 or 1.0
-            argument = f"{1 / reach:.6g}*{c.name}{-(high + low) / 2 / reach:+.6g}"
-            each.append([(f"T{k}({argument})", k) for k in range(1, CHEBYSHEV + 1)])
+            rational = [(text.format(x=c.name), RATIONAL_ORDER) for text in RATIONAL]
+            each.append([(_power(c.name, k), k) for k in range(1, POWERS + 1)] + rational)
     found = [("", 0), *(entry for functions in each for entry in functions)]
     for count in range(2, len(each) + 1):
         for chosen in combinations(each, count):
             found += _products(chosen)
     return sorted(found, key=lambda entry: entry[1])
+
+
+def _power(name: str, k: int) -> str:
+    return name if k == 1 else f"{name}^{k}"
+
+
+def families(basis: MonomialBasis) -> list[NDArray[np.bool_]]:
+    """Generic terms in growing families: those of lines have few functions at first, and then more.
+
+    Powers and rational functions that explain the same are all but dependent: no one can tell which of a rich
+    family are the true ones. A poorer one that explains the data as well is the better place to look.
+
+    Args:
+        basis: of `generic_basis`.
+
+    Returns:
+        Masks on its terms; a single one where no coordinate is a line.
+    """
+    lines = {c.name for c in basis.coordinates if c.topology == "line"}
+    shapes = tuple(shape.name for shape in basis.shapes)
+    degree, rational = np.zeros(basis.size, dtype=int), np.full(basis.size, "", dtype="U9")
+    for k, text in enumerate(basis.lagrangian):
+        for f in parse_term(text, basis.coordinates, shapes=shapes).factors:
+            if f.name in lines and f.function:
+                rational[k] = f.function
+            elif f.name in lines:
+                degree[k] += f.power
+    poor = [(rational == "") & (degree <= most) for most in DEGREES]
+    rich = [(degree <= DEGREES[0]) & np.isin(rational, ["", name]) for name in ("lorentz", "hyperbola")]
+    found = [*poor[:2], *rich, *poor[2:], np.ones(basis.size, dtype=bool)]
+    return [mask for k, mask in enumerate(found) if not any((mask == other).all() for other in found[:k])]
 
 
 def _products(factors: tuple[list[tuple[str, int]], ...]) -> list[tuple[str, int]]:
@@ -150,18 +200,21 @@ def _independent(basis: MonomialBasis, data: Dataset) -> MonomialBasis:
     random, (q, v, a, _) = np.random.default_rng(0), data.arrays
     shape = (PROBES * basis.size // v.shape[1] + 1, v.shape[1])
     middle, half = (q.max(axis=0) + q.min(axis=0)) / 2, (q.max(axis=0) - q.min(axis=0)) / 2
-    at = [random.uniform(-1, 1, shape) for _ in range(3)]
-    columns = evaluate(
-        basis.regressor(),
-        middle + MARGIN * half * at[0],
-        np.abs(v).max(axis=0) * at[1],
-        np.abs(a).max(axis=0) * at[2],
-        basis.start,
-    ).reshape(*shape, basis.size)
+    drawn = [random.uniform(-1, 1, shape) for _ in range(3)]
+    at = (
+        middle + MARGIN * half * drawn[0],
+        np.abs(v).max(axis=0) * drawn[1],
+        np.abs(a).max(axis=0) * drawn[2],
+    )
+    columns = evaluate(basis.regressor, *at, basis.start).reshape(*shape, len(basis.start))
+    columns = columns[:, :, : basis.size]
     power = columns * np.sqrt(np.mean(v**2, axis=0))[:, None]  # so that equations weigh alike
     flat = power.reshape(-1, basis.size)
     size = np.linalg.norm(flat, axis=0)
-    seen = size > DEPENDENT * size.max()  # else a total time derivative, of which rounding is left
+    # A total time derivative leaves nothing but rounding of the power that the term would have otherwise.
+    rate = np.ones(basis.size)
+    rate[: len(basis.lagrangian)] = np.exp(np.mean(np.log(np.std(a, axis=0) / np.std(v, axis=0))))
+    seen = size > DEPENDENT * rate * np.linalg.norm(evaluate(basis.values(), *at[:2]), axis=0)
     scaled = np.where(seen, flat / np.where(seen, size, 1), 0)
     new = np.abs(np.diag(np.linalg.qr(scaled, mode="r"))) > DEPENDENT
     return basis.only(new)
@@ -170,7 +223,9 @@ def _independent(basis: MonomialBasis, data: Dataset) -> MonomialBasis:
 # ── in words ─────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def entry(text: str, coordinates: tuple[Coordinate, ...]) -> tuple[str, str, float]:
+def entry(
+    text: str, coordinates: tuple[Coordinate, ...], shapes: tuple[str, ...] = ()
+) -> tuple[str, str, float]:
     """Where a term stands in 𝓛, its function of position there, and the factor of its coefficient.
 
     M_ij [α̇ twice], A_i [linear], V, F_i [a constant force]; so that ``0.5*sin(alpha)^2*alpha_dot^2`` is
@@ -179,9 +234,10 @@ def entry(text: str, coordinates: tuple[Coordinate, ...]) -> tuple[str, str, flo
     Args:
         text: a monomial.
         coordinates: the generalised coordinates, numbered from 1.
+        shapes: names of parameters inside functions.
     """
     velocities = [c.velocity for c in coordinates]
-    monomial = parse_term(text, coordinates)
+    monomial = parse_term(text, coordinates, shapes=shapes)
     if text in (pushed := [c.name if c.topology != "line" else "" for c in coordinates]):
         return f"F_{pushed.index(text) + 1}", "", 1.0
     moved = [f for f in monomial.factors if f.name in velocities and not f.function]
@@ -200,8 +256,9 @@ def entry(text: str, coordinates: tuple[Coordinate, ...]) -> tuple[str, str, flo
 
 def written(factor: Factor) -> str:
     """A factor as text, as the grammar reads it."""
-    argument = factor.name
-    if (factor.scale, factor.shift) != (1, 0):
-        argument = f"{factor.scale:.12g}*{factor.name}" + (f"{factor.shift:+.12g}" if factor.shift else "")
+    argument = factor.name if factor.scale == 1 else f"{factor.scale:.12g}*{factor.name}"
+    argument += f"/{factor.width}" if factor.width else ""
+    if factor.shift:
+        argument += factor.shift if isinstance(factor.shift, str) else f"{factor.shift:+.12g}"
     base = f"{factor.function}({argument})" if factor.function else argument
     return base if factor.power == 1 else f"{base}^{factor.power}"

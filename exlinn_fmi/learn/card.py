@@ -92,7 +92,8 @@ def report_card(
     found = found or identify(system, train, options, truth)
     terms = None
     if model.spec.form == "terms":
-        coefficients = np.concatenate([model.weights["lagrangian.terms"], model.weights["dissipation.terms"]])
+        names = ("lagrangian.terms", "dissipation.terms", "shapes")
+        coefficients = np.concatenate([model.weights[name] for name in names])
         terms = term_table(model.spec, coefficients, np.array(model.provenance["deviations"]))
         texts |= {"learn.objective": model.provenance["objective"], "learn.terms": formula(terms)}
     evaluation, units = _evaluation(system, (tests or [train])[0])

@@ -10,7 +10,7 @@ References: Schwarz (1978), Ann. Stat. 6, 461; Chen, Chen (2008), Biometrika 95,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -23,6 +23,7 @@ from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.projection import solve
 from exlinn_fmi.learn.trajectory import Fit, Information, Segments, Shooting, cut, maximum_likelihood
 from exlinn_fmi.learn.weak import inverse_regression, weak_regression
+from exlinn_fmi.mechanics.coordinates import input_names, state_names
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
 from exlinn_fmi.mechanics.monomials import MonomialBasis, parse_term
 
@@ -50,18 +51,33 @@ class Discovery:
 
     Args:
         stage: what was done last.
-        chosen: which of the generic family's terms stay.
-        fit: the fit of those.
+        basis: the generic family, with the shapes as they are known by now.
+        chosen: which of its terms stay.
+        fit: the fit of those; it has their parameters, and its information is on those that are not held.
+        known: all parameters of the family that are held, NaN for the others.
     """
 
     stage: str
-    chosen: Bool[NDArray[np.bool_], " P"]
+    basis: MonomialBasis
+    chosen: Bool[NDArray[np.bool_], " T"]
     fit: Fit
+    known: Float[Array, " P"]
 
     @property
     def p(self) -> Float[Array, " P"]:
-        """Coefficients of the whole family; exactly 0 where a term was pruned."""
-        return spread(self.fit.p, self.chosen)
+        """Parameters of the whole family; coefficients are exactly 0 where a term was pruned."""
+        kept = self.basis.kept(self.chosen)
+        return np.where(kept, spread(self.fit.p, kept), np.where(self._is_shape, self.basis.start, 0))
+
+    @property
+    def deviations(self) -> Float[Array, " P"]:
+        """Standard deviations of the parameters; 0 where pruned or held."""
+        free = self.basis.kept(self.chosen) & np.isnan(self.known)
+        return spread(np.sqrt(np.maximum(np.diag(self.fit.information.covariance), 0)), free)
+
+    @property
+    def _is_shape(self) -> Bool[NDArray[np.bool_], " P"]:
+        return np.arange(len(self.basis.start)) >= self.basis.size
 
 
 def spread(p: Float[Array, " K"], chosen: Bool[NDArray[np.bool_], " P"]) -> Float[Array, " P"]:
@@ -111,7 +127,8 @@ def start(
             chosen = orders <= highest
             for ridge in RIDGES if highest == orders.max() else RIDGES[:1]:
                 # Terms that do not take part are known to be 0.
-                out = np.where(chosen, held[: basis.size], 0.0)
+                given = held[: basis.size]
+                out = np.where(chosen | ~np.isnan(given), given, 0.0)
                 p = np.concatenate([regression.solve(ridge, out), at[basis.size :]])
                 if least_mass(basis, p, data) > LEAST_MASS and (error := shooting.misprediction(p)) < least:
                     best, least = p, error
@@ -126,59 +143,158 @@ def start(
 def _order(text: str, basis: MonomialBasis) -> int:
     """How elaborate a term is: powers of functions of position; friction beyond viscous counts as 1."""
     velocities = [c.velocity for c in basis.coordinates]
-    return sum(
-        1 if f.name in velocities else f.power * int(f.function[1:] if f.function[0] == "T" else 1)
-        for f in parse_term(text, basis.coordinates).factors
-        if f.function
-    )
+    shapes = [shape.name for shape in basis.shapes]
+    order = 0
+    for f in parse_term(text, basis.coordinates, shapes=shapes).factors:
+        if f.name in velocities:
+            order += bool(f.function)
+        elif f.name not in shapes and (f.function or f.power > 1):  # q alone may be a mere coupling
+            order += f.power * int(f.function[1:] if f.function[:1] == "T" else 1)
+    return order
 
 
-def prune(fit: Fit, samples: float, candidates: int) -> Bool[NDArray[np.bool_], " K"]:
+def prune(
+    fit: Fit,
+    samples: float,
+    candidates: int,
+    basis: MonomialBasis | None = None,
+    known: Float[Array, " P"] | None = None,
+) -> Bool[NDArray[np.bool_], " T"]:
     """Terms that stay, by backward elimination on the quadratic model of the likelihood.
 
     Args:
         fit: where the quadratic model holds.
         samples: number of residuals N.
         candidates: number of terms P of the generic family.
+        basis: the terms of the fit, if some of them have shapes.
+        known: parameters that are held, NaN for the others; their terms stay.
     """
     price = np.log(samples) + 2 * np.log(candidates)
-    stays = np.ones(len(fit.p), dtype=bool)
-    gradient = fit.information.matrix @ fit.p
-    while stays.sum() > 1:
-        left = np.flatnonzero(stays)
+    free = np.flatnonzero(np.ones(len(fit.p), bool) if known is None else np.isnan(known))
+    terms = len(fit.p) if basis is None else basis.size
+    stays = np.ones(terms, dtype=bool)
+    is_term = free < terms
+    # A shape moves the model by its column, of which as much as nothing is there at the optimum.
+    gradient = fit.information.matrix @ np.where(is_term, fit.p[free], 0)
+    while True:
+        kept = stays if basis is None else basis.kept(stays)
+        left = np.flatnonzero(kept[free])
+        if np.count_nonzero(is_term[left]) <= 1:
+            break
         # With the others refitted, p moves to where the gradient along all that stay vanishes again.
         covariance = Information(fit.information.matrix[np.ix_(left, left)]).covariance
         p = covariance @ gradient[left]
-        cost = p**2 / np.maximum(np.diag(covariance), np.finfo(float).tiny)
+        cost = np.where(is_term[left], p**2 / np.maximum(np.diag(covariance), np.finfo(float).tiny), np.inf)
         if cost.min() > price:
             break
-        stays[left[np.argmin(cost)]] = False
+        stays[free[left[np.argmin(cost)]]] = False
     return stays
 
 
-def discover(basis: MonomialBasis, data: Dataset) -> Iterator[Discovery]:
+def negative_friction(
+    basis: MonomialBasis, p: Float[Array, " P"], data: Dataset
+) -> Bool[NDArray[np.bool_], " T"]:
+    """Terms of D that give power to the motion, which no friction does.
+
+    Args:
+        basis: the terms.
+        p: their parameters.
+        data: where they act.
+    """
+    _, v, _, _ = data.arrays
+    columns = evaluate(basis.rest, np.zeros_like(v), v, p).reshape(*v.shape, len(p))
+    power = np.einsum("bn,bnk->k", v, columns)[: basis.size] * p[: basis.size]
+    gives: NDArray[np.bool_] = (power < 0) & (np.arange(basis.size) >= len(basis.lagrangian))
+    return gives
+
+
+def eliminate(
+    basis: MonomialBasis,
+    data: Dataset,
+    known: Float[Array, " P"],
+    fit: Callable[[MonomialBasis, Float[Array, " P"], Fit | None], Fit],
+    samples: float,
+    first: Bool[NDArray[np.bool_], " T"],
+) -> Iterator[Discovery]:
+    """Prune and refit, until every term is worth its price; yields after each fit.
+
+    Shapes are held where they start until the first pruning is done: of a term that goes nothing is to be
+    found.
+
+    Args:
+        basis: the generic family.
+        data: what it is fitted to.
+        known: parameters that are held, NaN for the others.
+        fit: of a family with some parameters held, from its start or from an earlier fit of them.
+        samples: number of residuals.
+        first: terms that are looked at.
+    """
+    chosen, held = first, known.copy()
+    held[basis.size :] = np.where(np.isnan(known), basis.start, known)[basis.size :]
+    last = fit(basis.only(chosen), held[basis.kept(chosen)], None)
+    yield Discovery("all terms", basis, chosen, last, held)
+    for _ in range(ROUNDS):
+        part, kept = basis.only(chosen), basis.kept(chosen)
+        stays = prune(last, samples, basis.size, part, held[kept])
+        negative = negative_friction(part, last.p, data) & np.isnan(held[kept][: part.size])
+        stays &= ~negative
+        now_free = np.isnan(known[basis.kept(chosen)]) & ~np.isnan(held[kept])
+        if stays.all() and not now_free.any():
+            break
+        chosen, held = chosen.copy(), known
+        chosen[np.flatnonzero(chosen)[~stays]] = False
+        last = last._replace(p=last.p[part.kept(stays)])
+        last = fit(basis.only(chosen), held[basis.kept(chosen)], last)
+        basis = basis.at(spread_over(last.p, basis, chosen))
+        yield Discovery("pruned", basis, chosen, last, held)
+
+
+def spread_over(
+    p: Float[Array, " K"], basis: MonomialBasis, chosen: Bool[NDArray[np.bool_], " T"]
+) -> Float[Array, " P"]:
+    """Parameters of some terms among all; shapes that do not take part as they start."""
+    kept = basis.kept(chosen)
+    return np.where(kept, spread(p, kept), basis.start)
+
+
+def discover(
+    basis: MonomialBasis,
+    data: Dataset,
+    known: Float[Array, " P"] | None = None,
+    first: Bool[NDArray[np.bool_], " T"] | None = None,
+) -> Iterator[Discovery]:
     """Find the terms that trajectories need; yields after the first fit, each pruning and the last fit.
 
     Args:
         basis: the generic family.
         data: trajectories.
+        known: parameters that are held, NaN for the others.
+        first: terms that are looked at; all of them if not given.
     """
-    system = basis.system()
-    names, size = system.state_names, data.frame[system.state_names].std().to_numpy()
-    segments = cut(data, names, system.input_names)
-    coarse = cut(data, names, system.input_names, max(len(data) // COARSE, 1))
+    names, inputs = state_names(basis.coordinates), input_names(basis.coordinates)
+    size = data.frame[names].std().to_numpy()
+    segments = cut(data, names, inputs)
+    coarse = cut(data, names, inputs, max(len(data) // COARSE, 1))
     coarse, judged = (replace(s, sigma=np.maximum(s.sigma, RELEVANT * size)) for s in (coarse, segments))
-    chosen = np.ones(basis.size, dtype=bool)
-    fit = maximum_likelihood(system, coarse, start(basis, data, coarse), passes=1)
-    fit = maximum_likelihood(system, judged, fit.p, iterations=CLOSE, passes=1)
-    yield Discovery("all terms", chosen, fit)
-    for _ in range(ROUNDS):
-        stays = prune(fit, judged.total * len(names), basis.size)
-        if stays.all():
-            break
-        chosen = chosen.copy()
-        chosen[np.flatnonzero(chosen)[~stays]] = False
-        system = basis.only(chosen).system()
-        fit = maximum_likelihood(system, judged, fit.p[stays], fit.states, passes=1)
-        yield Discovery("pruned", chosen, fit)
-    yield Discovery("likelihood", chosen, maximum_likelihood(system, segments, fit.p, fit.states))
+
+    def fit(part: MonomialBasis, held: Float[Array, " P"], last: Fit | None) -> Fit:
+        free = np.isnan(held)
+        system = part.system().bound(held)
+        if last is None:
+            first = start(part, data, coarse, held)
+            found = maximum_likelihood(system, coarse, first[free], passes=1)
+            found = maximum_likelihood(system, judged, found.p, iterations=CLOSE, passes=1)
+        else:
+            found = maximum_likelihood(system, judged, last.p[free], last.states, passes=1)
+        return found._replace(p=np.where(free, spread(found.p, free), held))
+
+    held = np.full(len(basis.start), np.nan) if known is None else known
+    first = np.ones(basis.size, dtype=bool) if first is None else first
+    for found in eliminate(basis, data, held, fit, judged.total * len(names), first):
+        yield found
+    part, held = found.basis.only(found.chosen), found.known[found.basis.kept(found.chosen)]
+    free, last = np.isnan(held), found.fit
+    final = maximum_likelihood(part.system().bound(held), segments, last.p[free], last.states)
+    final = final._replace(p=np.where(free, spread(final.p, free), held))
+    basis = found.basis.at(spread_over(final.p, found.basis, found.chosen))
+    yield replace(found, stage="likelihood", basis=basis, fit=final)

@@ -58,7 +58,7 @@ def estimate(data: Dataset, options: Identify, truth: Mapping[str, float], objec
     """
     unknowns = Unknowns.of(data.coordinates, options)
     basis, known = unknowns.basis, unknowns.known
-    chosen, why = choose(objective, basis, data)
+    chosen, why = choose(objective, basis, data, known)
     if chosen == "trajectory":
         system, free = basis.system().bound(known), np.isnan(known)
         segments = cut(data, system.state_names, system.input_names)

@@ -111,7 +111,7 @@ def identify(
     weight = 1 / np.maximum(np.sqrt(np.mean(force**2, axis=0)), np.finfo(float).tiny)
 
     def make(p: Float[Array, " P"]) -> Regression:
-        columns = evaluate(basis.regressor(), q, v, a, p).reshape(*v.shape, len(p))
+        columns = evaluate(basis.regressor, q, v, a, p).reshape(*v.shape, len(p))
         return Regression(columns * weight[:, None], force * weight, basis.size)
 
     fit = linear_fit(make, basis.start, 1, known=unknowns.known)

@@ -62,9 +62,9 @@ class _Data:
 
     @classmethod
     def of(cls, spec: ModelSpec, dataset: Dataset) -> _Data:
-        basis = MonomialBasis(spec.coordinates, spec.lagrangian_features, spec.dissipation_features)
+        basis = spec.basis
         q, v, a, force = dataset.arrays
-        terms = evaluate(basis.regressor(), q, v, a, basis.start).reshape(*v.shape, -1)
+        terms = evaluate(basis.regressor, q, v, a, basis.start).reshape(*v.shape, -1)
         return cls(*(torch.from_numpy(x).float() for x in (evaluate(basis.values(), q, v), terms, force)))
 
     def __len__(self) -> int:

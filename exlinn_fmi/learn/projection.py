@@ -49,7 +49,7 @@ def solve(
     terms = regression.terms
     free = terms + np.flatnonzero(np.isnan(held[terms:]))
     if not len(free):
-        return np.concatenate([regression.solve(known=held), start[terms:]])
+        return np.concatenate([regression.solve(known=held[:terms]), start[terms:]])
     problem = _Projected(make, start, held, terms, free)
     best = _grid(problem, len(free))
     last = np.inf
@@ -88,7 +88,7 @@ class _Projected:
         p = self.start.copy()
         p[self.free] *= np.exp(tau)
         regression = self.make(p)
-        p[: self.terms] = regression.solve(known=self.known)
+        p[: self.terms] = regression.solve(known=self.known[: self.terms])
         return p, regression
 
     def parameters(self, tau: Float[Array, " S"]) -> Float[Array, " P"]:

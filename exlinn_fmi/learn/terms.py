@@ -7,9 +7,11 @@ deviation, which goes into the model's provenance.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,13 +20,14 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
-from exlinn_fmi.learn.basis import entry, generic_basis
-from exlinn_fmi.learn.discover import Discovery, discover, least_mass, prune, spread
+from exlinn_fmi.learn.basis import entry, families, generic_basis
+from exlinn_fmi.learn.discover import COARSE, Discovery, discover, eliminate, least_mass, spread_over
 from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.learn.noise import CLEAN, relative_noise
 from exlinn_fmi.learn.projection import Make, solve
 from exlinn_fmi.learn.trajectory import Fit, Information, Shooting, cut, even
 from exlinn_fmi.learn.weak import OVERLAP, Regression, inverse_regression, weak_regression
+from exlinn_fmi.mechanics.coordinates import Parameter
 from exlinn_fmi.mechanics.learned import ModelSpec
 from exlinn_fmi.mechanics.monomials import MonomialBasis
 from exlinn_fmi.mechanics.structure import UNKNOWN, Structure
@@ -40,12 +43,16 @@ BETTER = 0.1
 """If not, and the weak form leaves less than this share of that, the accelerations are not to be trusted."""
 LEAST_MISFIT = 1e-6
 """Terms are judged as if forces had at least this noise, as a share of their size."""
+EXPLAINED = 1.1
+"""A family that leaves no more than so many times that explains all there is to explain."""
 
 
 def terms_spec(train: Dataset, options: Terms, structure: Structure = UNKNOWN) -> ModelSpec:
     """The model to train: the user's candidates, or generic ones that what is known of the plant leaves."""
     if options.lagrangian:
-        basis = MonomialBasis(train.coordinates, tuple(options.lagrangian), tuple(options.dissipation))
+        shapes = tuple(Parameter(name, value, "") for name, value in options.shapes.items())
+        texts = tuple(options.lagrangian), tuple(options.dissipation)
+        basis = MonomialBasis(train.coordinates, *texts, shapes)
     else:
         basis = generic_basis(train, structure)
     return ModelSpec(
@@ -54,16 +61,21 @@ def terms_spec(train: Dataset, options: Terms, structure: Structure = UNKNOWN) -
         0,
         lagrangian_features=basis.lagrangian,
         dissipation_features=basis.dissipation,
+        structure=structure,
+        inside=tuple((shape.name, shape.value) for shape in basis.shapes),
     )
 
 
-def choose(objective: Objective, basis: MonomialBasis, data: Dataset) -> tuple[Objective, str]:
+def choose(
+    objective: Objective, basis: MonomialBasis, data: Dataset, known: Float[Array, " P"] | None = None
+) -> tuple[Objective, str]:
     """What to make small, and why.
 
     Args:
         objective: what the user chose; ``auto`` leaves it to the data.
         basis: a family that can explain the data.
         data: what it is fitted to.
+        known: parameters that are held, NaN for the others.
     """
     if objective != "auto":
         return objective, f"{objective}: as the scenario says"
@@ -78,9 +90,9 @@ def choose(objective: Objective, basis: MonomialBasis, data: Dataset) -> tuple[O
             "trajectory",
             f"trajectory: {worst} has {100 * noise[worst]:.2g} % noise, the most of all states",
         )
-    misfit = _misfit(inverse_regression, basis, data)
+    misfit = _misfit(inverse_regression, basis, data, known)
     # Where neither fits it is the terms that fall short: no objective mends that.
-    if misfit > CONSISTENT and _misfit(weak_regression, basis, data) < BETTER * misfit:
+    if misfit > CONSISTENT and _misfit(weak_regression, basis, data, known) < BETTER * misfit:
         return (
             "trajectory",
             f"trajectory: states are clean, but {100 * misfit:.2g} % of forces do not fit the accelerations",
@@ -88,14 +100,23 @@ def choose(objective: Objective, basis: MonomialBasis, data: Dataset) -> tuple[O
     return "inverse", "inverse: the states are clean and the accelerations do not contradict them"
 
 
-def _misfit(kind: Callable[..., Regression], basis: MonomialBasis, data: Dataset) -> float:
+def _misfit(
+    kind: Callable[..., Regression],
+    basis: MonomialBasis,
+    data: Dataset,
+    known: Float[Array, " P"] | None,
+) -> float:
     """What the best of a family leaves unexplained."""
-    p = solve(partial(kind, basis, data), basis.start)
+    p = solve(partial(kind, basis, data), basis.start, known)
     return kind(basis, data, p).misfit(p)
 
 
 def iterate_terms(
-    spec: ModelSpec, train: Dataset, validation: Dataset, objective: Objective
+    spec: ModelSpec,
+    train: Dataset,
+    validation: Dataset,
+    objective: Objective,
+    known: Mapping[str, float] = MappingProxyType({}),
 ) -> Iterator[Iterate]:
     """Train; yields after each stage of the work.
 
@@ -104,15 +125,27 @@ def iterate_terms(
         train: data to fit.
         validation: data to watch.
         objective: what to make small.
+        known: terms, and shapes, whose values are held.
     """
-    basis = MonomialBasis(spec.coordinates, spec.lagrangian_features, spec.dissipation_features)
-    chosen, why = choose(objective, basis, train)
-    found = discover(basis, train) if chosen == "trajectory" else _least_squares(basis, train, chosen)
+    basis = spec.basis
+    names = [*basis.terms, *(shape.name for shape in basis.shapes)]
+    held = np.array([known.get(name, np.nan) for name in names], dtype=float)
+    at_start = np.arange(len(names)) >= basis.size  # shapes do not matter for this choice
+    chosen, why = choose(objective, basis, train, np.where(at_start, basis.start, held))
+    basis, first = narrow(basis, train, "inverse" if chosen == "inverse" else "weak", held)
+    if chosen == "trajectory":
+        found = discover(basis, train, held, first)
+    else:
+        found = _least_squares(basis, train, chosen, held, first)
     judge = prediction_error if chosen == "trajectory" else force_misfit
     for step, now in enumerate(found):
         p, count = now.p, len(basis.lagrangian)
         yield Iterate(
-            {"lagrangian.terms": p[:count], "dissipation.terms": p[count:]},
+            {
+                "lagrangian.terms": p[:count],
+                "dissipation.terms": p[count : basis.size],
+                "shapes": p[basis.size :],
+            },
             judge(basis, p, train),
             judge(basis, p, validation),
             now.stage,
@@ -122,15 +155,66 @@ def iterate_terms(
         )
 
 
-def _least_squares(basis: MonomialBasis, data: Dataset, objective: Objective) -> Iterator[Discovery]:
+def narrow(
+    basis: MonomialBasis, data: Dataset, objective: Objective, known: Float[Array, " P"]
+) -> tuple[MonomialBasis, NDArray[np.bool_]]:
+    """The family of terms that explains the data best for its size, by the same criterion as single terms.
+
+    Args:
+        basis: generic terms.
+        data: what they are to explain.
+        objective: ``inverse`` or ``weak``.
+        known: parameters that are held, NaN for the others.
+
+    Returns:
+        The basis with the shapes of that family's rational functions as they were found, and the family.
+    """
+    masks = families(basis)
+    if len(masks) == 1:
+        return basis, masks[0]
+    if objective == "inverse":
+        every = -(-len(data) // COARSE)
+        data = Dataset(data.frame[::every], data.coordinates)
+    best, found, family = np.inf, basis, masks[-1]
+    lengths = np.array([s.name.startswith(("a_", "h_")) for s in basis.shapes])
+    for mask in masks[:-1]:
+        part, kept = basis.only(mask), basis.kept(mask)
+        make, windows = regress(part, data, objective)
+        held = known[kept]
+        friction = np.append(np.zeros(part.size, dtype=bool), ~lengths[kept[basis.size :]])
+        held = np.where(friction & np.isnan(held), part.start, held)  # it is found when terms are few
+        p = solve(make, part.start, held)
+        regression = make(p)
+        samples = regression.force.size / windows
+        misfit = np.hypot(regression.misfit(p), LEAST_MISFIT)
+        score = 2 * samples * np.log(misfit) + part.size * (np.log(samples) + 2 * np.log(basis.size))
+        if score < best:
+            best, found, family = score, basis.at(spread_over(p, basis, mask)), mask
+        if misfit < EXPLAINED * LEAST_MISFIT:
+            break  # more terms cannot do better
+    return found, family
+
+
+def _least_squares(
+    basis: MonomialBasis,
+    data: Dataset,
+    objective: Objective,
+    known: Float[Array, " P"],
+    first: NDArray[np.bool_],
+) -> Iterator[Discovery]:
     """Least squares on all terms, and on those that pruning leaves."""
+
+    def fit(part: MonomialBasis, held: Float[Array, " P"], last: Fit | None) -> Fit:
+        make, windows = regress(part, data, objective)
+        return linear_fit(make, part.start, windows, LEAST_MISFIT, held)
+
     make, windows = regress(basis, data, objective)
-    chosen, regression = np.ones(basis.size, dtype=bool), make(basis.start)
-    fit = linear_fit(make, basis.start, windows, LEAST_MISFIT)
-    yield Discovery("all terms", chosen, fit)
-    chosen = prune(fit, regression.force.size / windows, basis.size)
-    part = regression.only(chosen)
-    yield Discovery("least squares", chosen, linear_fit(lambda p: part, basis.start[chosen], windows))
+    samples = make(basis.start).force.size / windows
+    for found in eliminate(basis, data, known, fit, samples, first):
+        yield found
+    part, held = found.basis.only(found.chosen), found.known[found.basis.kept(found.chosen)]
+    make, windows = regress(part, data, objective)
+    yield replace(found, stage="least squares", fit=linear_fit(make, part.start, windows, 0.0, held))
 
 
 def regress(basis: MonomialBasis, data: Dataset, objective: Objective) -> tuple[Make, int]:
@@ -171,7 +255,7 @@ def linear_fit(
 
 def force_misfit(basis: MonomialBasis, p: Float[Array, " P"], data: Dataset) -> float:
     """Square of the share of the forces that the inverse model (17) leaves unexplained."""
-    return inverse_regression(basis, data).misfit(p) ** 2
+    return inverse_regression(basis, data, p).misfit(p) ** 2
 
 
 def prediction_error(basis: MonomialBasis, p: Float[Array, " P"], data: Dataset) -> float:
@@ -182,17 +266,16 @@ def prediction_error(basis: MonomialBasis, p: Float[Array, " P"], data: Dataset)
         p: its coefficients.
         data: trajectories; the segments start as measured.
     """
-    kept = p != 0
-    system = basis.only(kept).system()
+    chosen = p[: basis.size] != 0
+    system = basis.only(chosen).system()
     size = data.frame[system.state_names].std().to_numpy()
     segments = replace(cut(data, system.state_names, system.input_names), sigma=np.where(size > 0, size, 1))
-    return Shooting(system, segments).misprediction(p[kept]) / (segments.total * len(size))
+    return Shooting(system, segments).misprediction(p[basis.kept(chosen)]) / (segments.total * len(size))
 
 
 def _notes(basis: MonomialBasis, found: Discovery, why: str, data: Dataset) -> dict[str, Any]:
     """Provenance: the objective and its reason, noise, and the terms with their deviations."""
-    deviation = spread(np.sqrt(np.diag(found.fit.information.covariance)), found.chosen)
-    return {"objective": why, "noise": relative_noise(data), "deviations": deviation.tolist()}
+    return {"objective": why, "noise": relative_noise(data), "deviations": found.deviations.tolist()}
 
 
 def term_table(spec: ModelSpec, p: Float[Array, " P"], deviations: Float[Array, " P"]) -> pd.DataFrame:
@@ -200,16 +283,21 @@ def term_table(spec: ModelSpec, p: Float[Array, " P"], deviations: Float[Array, 
 
     Args:
         spec: of the form ``terms``.
-        p: coefficients of 𝓛's terms, then of D's.
+        p: coefficients of 𝓛's terms, then of D's, then shapes.
         deviations: their standard deviations.
     """
     rows: list[tuple[Any, ...]] = []
-    texts = (*spec.lagrangian_features, *spec.dissipation_features)
-    for k in np.flatnonzero(p):
+    basis = spec.basis
+    texts = (*basis.terms, *(shape.name for shape in basis.shapes))
+    values = {name: f"{x:.6g}" for (name, _), x in zip(spec.inside, p[basis.size :], strict=True)}
+    names = "|".join(map(re.escape, values)) or "$^"
+    for k in np.flatnonzero((p != 0) & basis.kept(p[: basis.size] != 0)):
         if k < len(spec.lagrangian_features):
-            place, function, factor = entry(texts[k], spec.coordinates)
+            place, function, factor = entry(texts[k], spec.coordinates, tuple(values))
         else:
-            place, function, factor = "D", texts[k], 1.0
+            place, function, factor = ("D" if k < basis.size else "shape"), texts[k], 1.0
+        if place != "shape":
+            function = re.sub(rf"\b({names})\b", lambda match: values[match[0]], function)
         value, std = factor * p[k], abs(factor) * deviations[k]
         rows.append((place, function or "1", value, std, value - 1.96 * std, value + 1.96 * std, texts[k]))
     return pd.DataFrame(rows, columns=["entry", "function", "coefficient", "std", "low", "high", "term"])
@@ -218,7 +306,7 @@ def term_table(spec: ModelSpec, p: Float[Array, " P"], deviations: Float[Array, 
 def formula(table: pd.DataFrame) -> str:
     """The terms in one line: M_11 = 0.1 + 0.04 sin(alpha)^2; A_2 = 1 alpha; D = …."""
     parts = []
-    for place, rows in table.groupby("entry", sort=False):
+    for place, rows in table[table["entry"] != "shape"].groupby("entry", sort=False):
         terms = [
             f"{c:.6g}" if f == "1" else f"{c:.6g}*{f}"
             for c, f in zip(rows["coefficient"], rows["function"], strict=True)

@@ -55,7 +55,7 @@ class Regression(NamedTuple):
             ridge: weight of ‖p‖² in that scale.
             known: coefficients that are held, NaN where they are to be found.
         """
-        p = np.full(self.terms, np.nan) if known is None else known[: self.terms].copy()
+        p = np.full(self.terms, np.nan) if known is None else known.copy()
         free = np.isnan(p)
         p[free] = 0
         columns, right = self.columns[:, :, : self.terms][:, :, free], self.residual(p)
@@ -97,7 +97,7 @@ def inverse_regression(
     """
     q, v, a, force = data.arrays
     scale, p = force_scale(data), basis.start if p is None else p
-    columns = evaluate(basis.regressor(), q, v, a, p).reshape(*v.shape, len(p))
+    columns = evaluate(basis.regressor, q, v, a, p).reshape(*v.shape, len(p))
     return Regression(columns / scale[:, None], force / scale, basis.size)
 
 
@@ -110,7 +110,7 @@ def weak_regression(basis: MonomialBasis, data: Dataset, p: Float[Array, " P"] |
         p: where its columns are taken, if it has shapes; at its start if not given.
     """
     scale, at = force_scale(data), basis.start if p is None else p
-    momenta, rest = basis.momenta(), basis.rest()
+    momenta, rest = basis.momenta, basis.rest
     q, v, _, force = data.arrays
     columns, forces = [], []
     for rows, phi, slope, held in _windows(data):

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from exlinn_fmi.errors import ModelError
-from exlinn_fmi.mechanics.coordinates import Coordinate, check_coordinates
+from exlinn_fmi.mechanics.coordinates import Coordinate, Parameter, check_coordinates
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, Symbol
 from exlinn_fmi.mechanics.friction import log_cosh, stribeck
 from exlinn_fmi.mechanics.layout import Layout
@@ -96,6 +96,7 @@ class ModelSpec:
         lagrangian_features: monomials for 𝓛 (features and terms).
         dissipation_features: monomials for D (features and terms).
         structure: which energies the plant has; what it has not, the structured networks have not either.
+        inside: parameters inside functions of the monomials (terms), and where they were looked for.
     """
 
     form: Literal["structured", "features", "terms"]
@@ -106,6 +107,7 @@ class ModelSpec:
     lagrangian_features: tuple[str, ...] = ()
     dissipation_features: tuple[str, ...] = ()
     structure: Structure = UNKNOWN
+    inside: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         check_coordinates(self.coordinates)
@@ -138,6 +140,16 @@ class ModelSpec:
         """How the structured networks are laid out."""
         return Layout(self)
 
+    @property
+    def basis(self) -> MonomialBasis:
+        """Its monomials."""
+        return MonomialBasis(
+            self.coordinates,
+            self.lagrangian_features,
+            self.dissipation_features,
+            tuple(Parameter(name, value, "") for name, value in self.inside),
+        )
+
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of each weight array.
 
@@ -161,6 +173,7 @@ class ModelSpec:
             return {
                 "lagrangian.terms": (len(self.lagrangian_features),),
                 "dissipation.terms": (len(self.dissipation_features),),
+                "shapes": (len(self.inside),),
             }
         raise ModelError(f"unknown form of model {self.form!r}; expected 'structured', 'features' or 'terms'")
 
@@ -191,11 +204,12 @@ def learned_system(spec: ModelSpec, weights: Weights) -> LagrangianSystem:
     """
     check_weights(spec, weights)
     if spec.form == "terms":
-        p = np.concatenate([weights["lagrangian.terms"], weights["dissipation.terms"]])
-        found = MonomialBasis(spec.coordinates, spec.lagrangian_features, spec.dissipation_features)
-        return found.only(p != 0).system().bound(p[p != 0])
+        p = np.concatenate([weights[name] for name in ("lagrangian.terms", "dissipation.terms", "shapes")])
+        found = spec.basis
+        chosen = p[: found.size] != 0
+        return found.only(chosen).system().bound(p[found.kept(chosen)])
     if spec.form == "features":
-        basis = MonomialBasis(spec.coordinates, spec.lagrangian_features, spec.dissipation_features)
+        basis = spec.basis
         return LagrangianSystem.build(
             spec.coordinates,
             lambda q, v, p: _relu_network(weights, "lagrangian", basis.expressions(q, v)[0]),

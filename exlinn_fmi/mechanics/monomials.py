@@ -13,7 +13,8 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import chain, compress
 from typing import Any
 
@@ -250,15 +251,28 @@ class MonomialBasis:
         """All parameters p: coefficients of the terms, here 1, then the shapes."""
         return np.array([1.0] * self.size + [s.value for s in self.shapes])
 
+    @property
+    def uses(self) -> NDArray[np.bool_]:
+        """Which shapes each term holds, shape (terms, shapes)."""
+        found = np.zeros((self.size, len(self.shapes)), dtype=bool)
+        for k, monomial in enumerate(chain(*self._monomials())):
+            names = {name for factor in monomial.factors for name in factor.names}
+            found[k] = [s.name in names for s in self.shapes]
+        return found
+
     def kept(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Which of the parameters p belong to some of the terms.
 
         Args:
             chosen: which, in the order of `terms`.
         """
-        monomials = compress(chain(*self._monomials()), chosen)
-        used = {name for monomial in monomials for factor in monomial.factors for name in factor.names}
-        return np.array([*chosen, *(s.name in used for s in self.shapes)], dtype=bool)
+        return np.concatenate([chosen, self.uses[chosen].any(axis=0)])
+
+    def at(self, p: NDArray[np.float64]) -> MonomialBasis:
+        """The same basis with the shapes in p as their start."""
+        values = p[self.size :].tolist()
+        shapes = (replace(s, value=x) for s, x in zip(self.shapes, values, strict=True))
+        return replace(self, shapes=tuple(shapes))
 
     def only(self, chosen: NDArray[np.bool_]) -> MonomialBasis:
         """The basis of some of the terms, and the shapes in them.
@@ -288,6 +302,7 @@ class MonomialBasis:
             (*(Parameter(f"p{k}", 1.0, "") for k in range(self.size)), *self.shapes),
         )
 
+    @cached_property
     def regressor(self) -> ca.Function:
         """(q, v, a, p) → derivatives of the inverse model (17) by p, shape (n, parameters).
 
@@ -298,12 +313,14 @@ class MonomialBasis:
         columns = ca.jacobian(self.system().inverse(q, v, a, p), p)
         return ca.Function("regressor", [q, v, a, p], [ca.densify(columns)])
 
+    @cached_property
     def momenta(self) -> ca.Function:
         """(q, v, p) → derivatives of ∂𝓛/∂q̇ by p: F = d/dt(momenta · p) + rest · p without shapes."""
         q, v, _, p = self._symbols
         momentum = ca.gradient(self.system().lagrangian(q, v, p), v)
         return ca.Function("momenta", [q, v, p], [ca.densify(ca.jacobian(momentum, p))])
 
+    @cached_property
     def rest(self) -> ca.Function:
         """(q, v, p) → derivatives of −∂𝓛/∂q + ∂D/∂q̇ by p: what needs no derivative in time."""
         (q, v, _, p), system = self._symbols, self.system()

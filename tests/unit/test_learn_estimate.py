@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from learn_helpers import multisine, simulate
 from test_learn_noise_trajectory import COORDINATES, clean, noisy
 
 from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.learn.card import report_card
 from exlinn_fmi.learn.estimate import estimate
 from exlinn_fmi.learn.train import train
+from exlinn_fmi.plants import magnetic_levitation
 from exlinn_fmi.scenario.learning import Identify, Terms
 
 OPTIONS = Identify(
@@ -89,3 +91,67 @@ def test_steps_of_different_length_leave_the_linear_objectives() -> None:
     assert model.provenance["validation_loss"] < 1e-15
     rough = noisy(0.01).frame.drop(index=range(1000, 1010))
     assert "weak" in estimate(Dataset(rough, COORDINATES), OPTIONS, TRUTH, "auto").note
+
+
+# ── shapes and known parameters ──────────────────────────────────────────────────────────────────────────
+
+
+def coil(noise: float = 0.0) -> Dataset:
+    """A ball that falls, and hangs in the field of a coil, L(x) = 0.2 + 0.1/(1 + (x/0.02)²)."""
+    system = magnetic_levitation.PLANT.system.with_inputs({"v"})
+    time = np.arange(3001) * 1e-3
+    voltage = multisine(0.6, (0.2, 6), 20, 8, 2, time)[:, None]
+    frame = simulate(system, voltage, 1e-3, np.array([4e-3, 0, 0.9]))
+    for k, name in enumerate(("x", "x_dot", "i")):
+        frame[name] += noise * frame[name].std() * np.random.default_rng(k).standard_normal(len(frame))
+    return Dataset(frame, system.coordinates)
+
+
+COIL = Identify(
+    lagrangian={"m": "0.5*x_dot^2", "m*g": "x", "l_0": "0.5*i^2", "l_1": "0.5*lorentz(x/a)*i^2"},
+    dissipation={"b": "0.5*x_dot^2", "r": "0.5*i^2"},
+    shapes={"a": 0.01},
+)
+BALL = {p.name: p.value for p in magnetic_levitation.PLANT.parameters}
+
+
+def test_a_length_inside_a_function_is_identified_from_a_start_far_away() -> None:
+    found = estimate(coil(), COIL, BALL, "inverse").identified
+    assert found is not None
+    assert found.parameters["rel_error"].max() < 1e-8
+    assert found.parameters["name"].tolist()[-1] == "a"
+
+
+def test_a_length_has_an_interval_from_noisy_data_that_holds_the_truth() -> None:
+    found = estimate(coil(0.001), COIL, BALL, "trajectory").identified
+    assert found is not None
+    table = found.parameters
+    assert (np.abs(table["identified"] - table["true"]) < 4 * table["std"]).all()
+    assert table["std"].iloc[-1] < 0.02 * table["identified"].iloc[-1]
+
+
+@pytest.mark.parametrize("objective", ["weak", "trajectory"])
+def test_known_parameters_are_held_and_help_the_others(objective) -> None:
+    data = noisy(0.01, seed=4)
+    options = OPTIONS.model_copy(update={"known": {"l": 1.0, "k_e": 1.0}})
+    (free, _), (held, note) = (estimate(data, o, TRUTH, objective) for o in (OPTIONS, options))
+    assert free is not None
+    assert held is not None
+    before, after = (found.parameters.set_index("name") for found in (free, held))
+    assert (after.loc[["l", "k_e"], "identified"] == 1).all()
+    assert (after.loc[["l", "k_e"], "std"] == 0).all()
+    assert after.loc["j_m", "std"] < before.loc["j_m", "std"]
+    assert "held: l = 1, k_e = 1" in note
+
+
+def test_known_coefficients_of_terms_are_held() -> None:
+    candidates = Terms(
+        preset="terms",
+        lagrangian=[*OPTIONS.lagrangian.values(), "-1*cos(alpha)"],
+        dissipation=list(OPTIONS.dissipation.values()),
+        known={"0.5*i^2": 1.1},
+    )
+    for objective in ("inverse", "trajectory"):
+        model = train(clean(), clean(), candidates, seed=0, objective=objective)
+        assert model.weights["lagrangian.terms"][2] == 1.1
+        assert model.provenance["deviations"][2] == 0

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import importlib
+
 import casadi as ca
 import numpy as np
+import pandas as pd
 import pytest
-from learn_helpers import simulate
+from learn_helpers import multisine, simulate
 from test_learn_noise_trajectory import COORDINATES, FAMILY, STATES, TRUE, clean, noisy
 
 from exlinn_fmi.data.dataset import Dataset, split
 from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.basis import entry, generic_basis, position_functions, written
-from exlinn_fmi.learn.discover import discover, least_mass, prune, spread, start
+from exlinn_fmi.learn.discover import discover, least_mass, negative_friction, prune, spread, start
 from exlinn_fmi.learn.terms import choose, formula, iterate_terms, term_table, terms_spec
 from exlinn_fmi.learn.train import train
 from exlinn_fmi.learn.trajectory import Fit, Information, cut
 from exlinn_fmi.learn.weights import load_model, save_model
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
+from exlinn_fmi.mechanics.friction import log_cosh
 from exlinn_fmi.mechanics.monomials import MonomialBasis, parse_monomial
 from exlinn_fmi.scenario.learning import Terms
 
@@ -37,7 +41,7 @@ CANDIDATES = Terms(
 def candidates(data: Dataset) -> MonomialBasis:
     """Nine candidates, six of them true."""
     spec = terms_spec(data, CANDIDATES)
-    return MonomialBasis(spec.coordinates, spec.lagrangian_features, spec.dissipation_features)
+    return spec.basis
 
 
 def line() -> Dataset:
@@ -60,7 +64,7 @@ def test_no_direction_of_the_generic_terms_is_a_gauge(make) -> None:
     basis = generic_basis(make())
     random, n = np.random.default_rng(3), len(basis.coordinates)
     at = random.uniform(-1, 1, (3, 400, n)) * np.abs([x.max(axis=0) + 1 for x in make().arrays[:3]])[:, None]
-    columns = evaluate(basis.regressor(), *at, basis.start).reshape(-1, basis.size)
+    columns = evaluate(basis.regressor, *at, basis.start).reshape(-1, len(basis.start))[:, : basis.size]
     singular = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), compute_uv=False)
     assert singular[-1] > 1e-4
 
@@ -76,22 +80,20 @@ def test_mechanical_and_electrical_masses_are_not_coupled() -> None:
     assert not any("alpha_dot*i" in text for text in generic_basis(clean()).lagrangian)
 
 
-def test_chebyshev_covers_the_data_and_a_margin() -> None:
-    (_, _), (text, order), *_ = position_functions((Coordinate("x", "m"),), np.array([[1.0], [3.0]]))
-    value = [parse_monomial(text, ["x"]).evaluate({"x": x}) for x in (1.0, 3.0, 2.0)]
-    assert order == 1
-    assert np.array(value, dtype=float) == pytest.approx([-1 / 1.1, 1 / 1.1, 0], abs=1e-5)
+def test_a_line_has_powers_and_rational_functions_whose_shapes_are_found() -> None:
+    functions = position_functions((Coordinate("x", "m"),))
+    assert functions[:3] == [("", 0), ("x", 1), ("x^2", 2)]
+    assert ("lorentz(x/a_x)", 3) in functions
 
 
 def test_degrees_are_turned_into_radians() -> None:
-    functions = position_functions((Coordinate("a", "deg", topology="circle"),), np.zeros((2, 1)))
+    functions = position_functions((Coordinate("a", "deg", topology="circle"),))
     assert float(parse_monomial(functions[1][0], ["a"]).evaluate({"a": 90.0})) == pytest.approx(1)
 
 
 def test_products_of_coordinates_stay_below_the_third_order() -> None:
     functions = position_functions(
-        (Coordinate("a", "rad", topology="circle"), Coordinate("b", "rad", topology="circle")),
-        np.zeros((2, 2)),
+        (Coordinate("a", "rad", topology="circle"), Coordinate("b", "rad", topology="circle"))
     )
     assert ("sin(a)*sin(b)", 2) in functions
     assert max(order for text, order in functions if "a" in text and "b" in text) == 3
@@ -174,7 +176,7 @@ def test_true_terms_and_no_others_are_found_in_noise(level) -> None:
 
 def test_clean_data_are_learned_to_rounding_from_generic_terms() -> None:
     model = train(*split(clean(), 0.8, 4, 0), Terms(preset="terms"), seed=0)
-    kept = np.concatenate(list(model.weights.values()))
+    kept = np.concatenate([model.weights[f"{part}.terms"] for part in ("lagrangian", "dissipation")])
     assert sorted(kept[kept != 0]) == pytest.approx(sorted(TRUE), rel=1e-9)
     assert model.provenance["objective"].startswith("inverse")
 
@@ -234,3 +236,65 @@ def test_terms_are_reported_as_formulas_with_intervals() -> None:
 
 def test_coefficients_are_spread_over_all_terms() -> None:
     assert spread(np.array([2.0]), np.array([False, True])).tolist() == [0, 2]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("magnetic_levitation", {"M_22": {"": 0.2, "lorentz(x/0.02)": 0.1}, "V": {"x": -0.4905}}),
+        ("mems_actuator", {"V": {"x^2": 10, "Q^2": 7.0588e9, "x*Q^2": -1.41176e12}}),
+    ],
+)
+def test_inductance_and_capacitance_are_found_as_formulas(name, expected) -> None:
+    module = importlib.import_module(f"exlinn_fmi.plants.{name}")
+    system, time = module.PLANT.system, np.arange(2001) * 2e-3
+    coil = name == "magnetic_levitation"
+    force, volt = (0.15, (8.0, 0.6)) if coil else (5e-3, (700.0, 250.0))
+    frames = [
+        simulate(
+            system,
+            np.column_stack(
+                [
+                    multisine(force, (0.3, 8), 20, 0, seed, time),
+                    sign * multisine(volt[1], (0.1, 6), 20, volt[0], seed, time),
+                ]
+            ),
+            2e-3,
+            np.array([4e-3, 0, 0.9]) if coil else np.array([0, sign * 5e-8, 0, 0]),
+            seed,
+        )
+        for seed, sign in ((1, 1), (2, -1))
+    ]
+    data = Dataset(pd.concat(frames), system.coordinates)
+    model = train(*split(data, 0.8, 4, 0), Terms(preset="terms"), seed=0)
+    p = np.concatenate(list(model.weights.values()))
+    table = term_table(model.spec, p, np.array(model.provenance["deviations"]))
+    for place, functions in expected.items():
+        rows = table[table["entry"] == place]
+        assert dict(zip(rows["function"].replace("1", ""), rows["coefficient"], strict=True)) == {
+            function: pytest.approx(value, rel=1e-4) for function, value in functions.items()
+        }
+    assert model.provenance["validation_loss"] < 1e-20
+
+
+def test_friction_is_found_with_the_speed_where_it_sets_in() -> None:
+    coordinates = (Coordinate("x", "m", input="f", input_unit="N"),)
+    system = LagrangianSystem.build(
+        coordinates,
+        lambda q, v, p: v[0] ** 2 - 3 * q[0] ** 2,
+        lambda v, p: v[0] ** 2 / 4 + 0.3 * 0.05 * log_cosh(v[0] / 0.05),
+    )
+    t = np.arange(1600) * 5e-3
+    data = Dataset(simulate(system, 2 * np.sin(t**1.5)[:, None], 5e-3), coordinates)
+    model = train(*split(data, 0.8, 4, 0), Terms(preset="terms"), seed=0)
+    p = np.concatenate(list(model.weights.values()))
+    table = term_table(model.spec, p, np.array(model.provenance["deviations"])).set_index("term")
+    assert table.loc["s_x_dot", "coefficient"] == pytest.approx(0.05, rel=1e-6)
+    assert table.loc["s_x_dot*logcosh(x_dot/s_x_dot)", "coefficient"] == pytest.approx(0.3, rel=1e-6)
+    assert "0.05*logcosh(x_dot/0.05)" in formula(table.reset_index())
+    assert (table["coefficient"].loc[["0.5*x_dot^2"]] > 0).all()
+
+
+def test_a_term_that_would_push_instead_of_rub_is_left_out() -> None:
+    basis = MonomialBasis(COORDINATES, ("0.5*i^2",), ("0.5*i^2", "abs(i)^3"))
+    assert negative_friction(basis, np.array([1.0, 2.0, -0.1]), clean()).tolist() == [False, False, True]

@@ -84,7 +84,7 @@ def test_regressor_of_the_true_basis_is_the_plants_inverse_model() -> None:
     j_m, m_c, d, inductance, k_e, b_m, r = p
     truth = np.array([j_m, m_c * d**2, inductance, k_e, b_m, r])
     force = evaluate(PLANT.system.inverse, q, v, a, p)
-    assert evaluate(TRUE_BASIS.regressor(), q, v, a, TRUE_BASIS.start) @ truth == pytest.approx(
+    assert evaluate(TRUE_BASIS.regressor, q, v, a, TRUE_BASIS.start) @ truth == pytest.approx(
         force, abs=1e-12
     )
 
@@ -101,4 +101,4 @@ def test_values_of_the_true_basis_make_the_plants_lagrangian_and_dissipation() -
 
 def test_a_basis_may_have_no_terms_for_dissipation() -> None:
     basis = MonomialBasis(COORDINATES, ("0.5*i^2", "i*alpha"), ())
-    assert evaluate(basis.regressor(), *np.ones((3, 3, 2)), basis.start).shape == (3, 2, 2)
+    assert evaluate(basis.regressor, *np.ones((3, 3, 2)), basis.start).shape == (3, 2, 2)

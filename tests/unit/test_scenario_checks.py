@@ -246,6 +246,28 @@ def test_a_metric_is_of_what_there_is(tmp_path):
         ),
         ("{l: 0.5*i^2}", "{l: 0.5*i^x}", "identify.lagrangian.l", "is not a factor"),
         ("{r: 0.5*i^2}", "{r: 0.5*alpha^2}", "identify.dissipation.r", "unknown name 'alpha'"),
+        ("{r: 0.5*i^2}", "{r: s*logcosh(i/s)}", "identify.dissipation.r", "unknown name 's'"),
+        ("{r: 0.5*i^2}", "{r: logcosh(i/s)}", "identify.dissipation.r", "'s' is no shape"),
+        (
+            "{r: 0.5*i^2}",
+            "{r: 0.5*i^2}\n    shapes: {s: 1}",
+            "identify.shapes.s",
+            "no monomial holds 's'; write e.g. `s*logcosh(v/s)`",
+        ),
+        (
+            "{r: 0.5*i^2}",
+            "{r: s*logcosh(i/s)}\n    shapes: {s: 0}",
+            "identify.shapes.s",
+            "expected a start of the right sign and size, found 0",
+        ),
+        ("{r: 0.5*i^2}", "{r: 0.5*i^2}\n    known: {rr: 5}", "identify.known.rr", "did you mean 'r'?"),
+        ("{r: 0.5*i^2}", "{l: 0.5*i^2}", "identify", "'l' is the name of two parameters"),
+        (
+            "      topology: circle\n",
+            "      topology: circle\n      friction: [dry]\n",
+            "coordinates[0].friction[0]",
+            "viscous",
+        ),
     ],
 )
 def test_learning_fits_its_plant(tmp_path, old, new, path, message):
@@ -429,3 +451,20 @@ def test_units_that_mean_the_same_agree(one, other):
 )
 def test_units_that_differ_do_not_agree(one, other):
     assert not same_unit(one, other)
+
+
+def test_sines_of_degrees_are_refused_with_the_factor_to_rad(tmp_path):
+    rows = "".join(f"{0.01 * k},{k % 7},{k % 5}\n" for k in range(50))
+    (tmp_path / "data.csv").write_text("time,phi,u\n" + rows)
+    text = """\
+name: degrees
+learn:
+  data: {files: [data.csv]}
+  coordinates:
+    - {name: phi, unit: deg, topology: circle, input: u, input_unit: N.m}
+  identify:
+    lagrangian: {j: 0.5*phi_dot^2, m: cos(0.017453292519943295*phi), w: cos(phi)}
+"""
+    found = problems(tmp_path, text)
+    assert [f.path for f in found] == ["learn.identify.lagrangian.w"]
+    assert "write cos(0.017453292519943295*phi)" in found[0].message
