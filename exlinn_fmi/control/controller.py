@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values
-from exlinn_fmi.control.defaults import completed, estimator, measure
+from exlinn_fmi.control.defaults import completed, estimator, measure, refined
 from exlinn_fmi.control.diagnosis import diagnose
 from exlinn_fmi.control.estimator import Belief
 from exlinn_fmi.control.ocp import HORIZON, Ocp, check_names
@@ -109,6 +109,7 @@ class NmpcController(Component):
             generator = ReferenceGenerator(system, options.reference, folder, step, sight)
             check_names("safe_input", options.safe_input, system.input_names, "inputs")
             sizes, first = measure(options, system, generator, step, sight)
+            options = refined(options, system, first, step)
             options = completed(options, system, sizes, first, step)
             self._ocp = Ocp(system, options, step, generator.states)
             self._estimator = estimator(options, system, sizes, first, step, connected)

@@ -3,6 +3,7 @@
 - **Horizon**: one and a half of the model's slowest response, so that it is seen to settle.
 - **Weights**: an input weighs one where it uses half of its range. The referenced state weighs `KEENNESS`
   where it is off by what that moves it within the slowest response, so that units do not matter.
+- **Sub-steps** of RK4: its step times the fastest pole stays below `STABLE`.
 - **Estimator**: sizes of states from the reference and the bounds, sizes of forces from what changes such a
   state within the slowest response, noise and disturbances as shares of these.
 """
@@ -41,6 +42,9 @@ KEENNESS = 100.0
 ACCURACY = 1e-4
 """Noise of a measurement over the size of the state: that of a good encoder or a 14-bit converter."""
 
+STABLE = 1.0
+"""Largest step of RK4 over the fastest time constant: stable, and right to 1 % of that mode."""
+
 UNKNOWN_FORCE = 1e-2
 """What the model does not know of a force in a single sample, over its size."""
 
@@ -75,7 +79,7 @@ def completed(options: Nmpc, system: LagrangianSystem, sizes: Sizes, first: Refe
         first: the reference at the beginning.
         step: sampling time [s].
     """
-    horizon = options.horizon or int(np.clip(np.ceil(SIGHT * sizes.response / step), SHORTEST, LONGEST))
+    horizon = options.horizon or int(np.clip(np.ceil(SIGHT * sizes.response / step - 1e-6), SHORTEST, LONGEST))
     weights = options.weights
     if options.cost == "tracking" and None in (weights.states, weights.inputs):
         reach = _reach(options, system, sizes, first, step)
@@ -89,6 +93,22 @@ def completed(options: Nmpc, system: LagrangianSystem, sizes: Sizes, first: Refe
             update = {key: derived[key] for key, value in given.items() if value is None}
             weights = weights.model_copy(update=update)
     return options.model_copy(update={"horizon": horizon, "weights": weights})
+
+
+def refined(options: Nmpc, system: LagrangianSystem, first: References, step: float) -> Nmpc:
+    """The settings with the sub-steps filled in where they are open.
+
+    Args:
+        options: the settings.
+        system: the prediction model.
+        first: the reference at the beginning.
+        step: sampling time [s].
+    """
+    if options.substeps is not None:
+        return options
+    rates = poles(system, first.x[0], first.u[0])
+    fastest = float(np.abs(rates).max()) if np.isfinite(rates).all() else 0.0
+    return options.model_copy(update={"substeps": int(np.clip(np.ceil(fastest * step / STABLE), 1, 100))})
 
 
 def measure(
@@ -165,15 +185,18 @@ def estimator(
     if kind == "none":
         # What nothing is connected to keeps its start value.
         return Direct(
-            system, _noise(spec, system, np.full(len(names), True), sizes, first, []), step, options.substeps
+            system,
+            _noise(spec, system, np.full(len(names), True), sizes, first, []),
+            step,
+            options.substeps or 1,
         )
     if not measured.any():
         raise ModelError(f"estimator: no state is measured; connect some of {', '.join(names)}")
     noise = _noise(spec, system, measured, sizes, first, spec.disturbances)
     if kind == "mhe":
-        return MovingHorizon(system, noise, step, options.substeps, spec.window, spec.iterations)
+        return MovingHorizon(system, noise, step, options.substeps or 1, spec.window, spec.iterations)
     steady = (first.x[0], first.u[0]) if spec.gain == "steady" else None
-    return ExtendedKalman(system, noise, step, options.substeps, steady)
+    return ExtendedKalman(system, noise, step, options.substeps or 1, steady)
 
 
 def at_rest(system: LagrangianSystem, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -196,19 +219,26 @@ def response_time(
         u: input (m,).
         horizon: time over which a mode must change to be none [s].
     """
-    A = evaluate(system.state_jacobian, x, u, system.parameter_values)[0].reshape(len(x), len(x))
-    if not np.isfinite(A).all():
-        return None
-    rates = np.abs(np.linalg.eigvals(A))
+    rates = np.abs(poles(system, x, u))
     seen = rates[rates * horizon > INTEGRATOR]
     return float(1.0 / seen.min()) if len(seen) else None
+
+
+def poles(
+    system: LagrangianSystem, x: Float[np.ndarray, " n"], u: Float[np.ndarray, " m"]
+) -> NDArray[np.complex128]:
+    """Eigenvalues [1/s] of the model linearised at a state (n,) and input (m,), NaN if that is not finite."""
+    A = evaluate(system.state_jacobian, x, u, system.parameter_values)[0].reshape(len(x), len(x))
+    if not np.isfinite(A).all():
+        return np.full(len(x), np.nan + 0j)
+    return np.linalg.eigvals(A).astype(np.complex128)
 
 
 def _reach(
     options: Nmpc, system: LagrangianSystem, sizes: Sizes, first: References, step: float
 ) -> NDArray[np.float64]:
     """How far the inputs' half ranges move each referenced state within the slowest response, 0 elsewhere."""
-    sensitivities = Batch(rk4_sensitivities(system, options.substeps), 1)
+    sensitivities = Batch(rk4_sensitivities(system, options.substeps or 1), 1)
     x, p = at_rest(system, first.x[0]), system.parameter_values
     _, A, B = (part[0].copy() for part in sensitivities(x, first.u[0], p, step))
     moved = np.zeros_like(B)

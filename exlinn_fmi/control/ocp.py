@@ -139,11 +139,11 @@ class Ocp:
         largest = max(self.Q.max(), self.R.max())
         self.l1 = PENALTY * largest * self.limits.span
         self.l2 = PENALTY * largest * np.ones_like(self.limits.span)
-        loaded = system.loaded()
-        sensitivities = rk4_sensitivities(loaded, options.substeps)
+        loaded, substeps = system.loaded(), options.substeps or 1
+        sensitivities = rk4_sensitivities(loaded, substeps)
         self._linearise = Batch(sensitivities, self.horizon)
         self._linearise_one = Batch(sensitivities, 1)
-        self.discrete = loaded.rk4(options.substeps)
+        self.discrete = loaded.rk4(substeps)
         """One interval of the prediction: (x, u, p, h) → x⁺, with `parameters(force)` as p."""
         self._predict = Batch(self.discrete, self.horizon)
 
@@ -190,7 +190,7 @@ class Ocp:
         if self.terminal == "dare":
             A, B = self.linearise_at(x[-1], u[-1], references.force)
             # An input without weight would leave R singular.
-            R = np.maximum(self.R, np.eye(self.m) * 1e-12 * max(1.0, self.Q.max()))
+            R = self.R + np.diag(np.where(np.diagonal(self.R) > 0.0, 0.0, 1e-12 * max(1.0, self.Q.max())))
             P = solve_dare(A, B, self.Q, R)
         factor = FALLBACK_TERMINAL if self.terminal == "dare" else self.terminal
         target = np.zeros_like(u) if self.paper else u

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from exlinn_fmi.control.ocp import Linearisation, Ocp, Targets
 from exlinn_fmi.control.qp import QpSolution, StageQp, make_qp_solver
 from exlinn_fmi.control.reference import References
+from exlinn_fmi.control.scaling import ScaledQp, units
 from exlinn_fmi.errors import SolverError
 
 SHORTEST = 2.0**-10
@@ -151,7 +152,7 @@ class GaussNewton(Solver):
     def __init__(self, ocp: Ocp, iterations: int, tolerance: float, real_time: bool) -> None:
         super().__init__(ocp, iterations, tolerance)
         self.real_time = real_time
-        self.qp = make_qp_solver(ocp.horizon, ocp.n, ocp.m, ocp.limits.soft)
+        self.qp = ScaledQp(make_qp_solver(ocp.horizon, ocp.n, ocp.m, ocp.limits.soft), ocp.limits.soft)
         """Solver of the quadratic programs."""
 
     def _solve(self, plan: Plan, targets: Targets, cold: bool) -> Solution:
@@ -206,16 +207,18 @@ class GaussNewton(Solver):
         """KKT residual at a plan, with the multipliers of its quadratic program.
 
         These make gradient + Hessian · step + constraints' part vanish, so Hessian · step is what the
-        gradient of the Lagrangian is off by; and the gaps of the dynamics.
+        gradient of the Lagrangian is off by; and the gaps of the dynamics. Each in units that cost about one.
         """
         ocp = self.ocp
+        x, u = units(2.0 * targets.P, 2.0 * ocp.R, at.B[-1])
+        soft = x[ocp.limits.soft]
         slack = step.slack - ocp.violations(plan.x)
         parts = (
-            2.0 * step.dx[:-1] @ ocp.Q,
-            2.0 * targets.P @ step.dx[-1],
-            2.0 * step.du @ ocp.R,
-            slack * ocp.l2,
-            at.next - plan.x[1:],
+            2.0 * step.dx[:-1] @ ocp.Q * x,
+            2.0 * targets.P @ step.dx[-1] * x,
+            2.0 * step.du @ ocp.R * u,
+            slack * ocp.l2 * soft,
+            (at.next - plan.x[1:]) / x,
         )
         return float(max(np.abs(part).max(initial=0.0) for part in parts))
 

@@ -139,7 +139,12 @@ class Nmpc(Spec):
     )
     iterations: int = Field(50, ge=1, description="most iterations of `sqp` and `ipopt`")
     tolerance: Positive = Field(1e-8, description="KKT tolerance of `sqp` and `ipopt`")
-    substeps: int = Field(1, ge=1, le=100, description="RK4 steps in one interval")
+    substeps: int | None = Field(
+        None,
+        ge=1,
+        le=100,
+        description="RK4 steps in one interval; from the model's fastest pole if not given",
+    )
     estimator: Annotated[
         Annotated[EstimatorKind, Tag("text")] | Annotated[Estimator, Tag("a mapping")], Discriminator(form)
     ] = Field("auto", description="how states that are not measured, and disturbances, are found")

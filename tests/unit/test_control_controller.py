@@ -88,7 +88,7 @@ def test_unit_of_the_reference_is_taken_from_where_it_is_known(reference, unit):
 
 
 def test_outputs_answer_the_measurements_of_the_same_tick():
-    made = controller()
+    made = controller(weights=Weights(states=10.0, inputs=1e-3))
     one, _ = measure(made, *START)
     other, _ = measure(made, np.pi / 2 + 0.4, 2.0, 0.0)
     again, _ = measure(made, *START)
