@@ -79,7 +79,8 @@ def completed(options: Nmpc, system: LagrangianSystem, sizes: Sizes, first: Refe
         first: the reference at the beginning.
         step: sampling time [s].
     """
-    horizon = options.horizon or int(np.clip(np.ceil(SIGHT * sizes.response / step - 1e-6), SHORTEST, LONGEST))
+    sight = np.ceil(SIGHT * sizes.response / step - 1e-6)
+    horizon = options.horizon or int(np.clip(sight, SHORTEST, LONGEST))
     weights = options.weights
     if options.cost == "tracking" and None in (weights.states, weights.inputs):
         reach = _reach(options, system, sizes, first, step)
