@@ -21,6 +21,7 @@ from exlinn_fmi.scenario.schema import (
 )
 
 if TYPE_CHECKING:
+    from exlinn_fmi.components.fmu import FmuSettings
     from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 
 
@@ -37,7 +38,7 @@ def inspect(spec: ComponentBase, folder: Path) -> Sequence[Variable]:
     if isinstance(spec, FmuComponent):
         from exlinn_fmi.components.fmu import read_variables
 
-        return read_variables(folder / spec.fmu, runnable=True)
+        return read_variables(folder / spec.fmu, runnable=True, settings=fmu_settings(spec))
     if isinstance(spec, NmpcComponent):
         return nmpc_variables(model_system(spec.nmpc.model, folder, folder).coordinates, spec.nmpc)
     component = make("component", spec, folder, folder)
@@ -64,7 +65,7 @@ def build(name: str, scenario: Scenario, folder: Path, run_folder: Path) -> Comp
         from exlinn_fmi.components.isolated import isolated_fmu
 
         memory = None if spec.memory is None else 1e6 * spec.memory
-        return isolated_fmu(name, folder / spec.fmu, spec.timeout, memory)
+        return isolated_fmu(name, folder / spec.fmu, spec.timeout, memory, fmu_settings(spec))
     if not isinstance(spec, NmpcComponent):
         return make(name, spec, folder, run_folder)
     from exlinn_fmi.control.controller import NmpcController
@@ -84,7 +85,7 @@ def make(name: str, spec: ComponentBase, folder: Path, run_folder: Path) -> Comp
     if isinstance(spec, FmuComponent):
         from exlinn_fmi.components.fmu import FmuComponent as Fmu
 
-        return Fmu(name, folder / spec.fmu)
+        return Fmu(name, folder / spec.fmu, fmu_settings(spec))
     if isinstance(spec, PlantComponent):
         from exlinn_fmi.components.lagrangian import LagrangianComponent
         from exlinn_fmi.plants import plant
@@ -106,6 +107,14 @@ def make(name: str, spec: ComponentBase, folder: Path, run_folder: Path) -> Comp
 def is_isolated(spec: FmuComponent, scenario: Scenario, folder: Path) -> bool:
     """Whether an FMU runs in a process of its own: as it says, else where the scenario does not trust it."""
     return spec.isolate if spec.isolate is not None else not scenario.trusts(folder / spec.fmu, folder)
+
+
+def fmu_settings(spec: FmuComponent) -> FmuSettings:
+    """How a scenario wants an FMU to be used."""
+    from exlinn_fmi.components.fmu import FmuSettings
+
+    numbers = {name: float(value) for name, value in spec.start.items() if isinstance(value, int | float)}
+    return FmuSettings(spec.interface, spec.solver, spec.tolerance, numbers)
 
 
 def model_system(reference: str, folder: Path, run_folder: Path) -> LagrangianSystem:

@@ -26,7 +26,7 @@ from exlinn_fmi.components.native import Native
 
 Causality = Literal["parameter", "input", "output", "local", "independent"]
 Variability = Literal["constant", "fixed", "tunable", "discrete", "continuous"]
-VariableType = Literal["Real", "Integer", "Boolean", "Enumeration"]
+VariableType = Literal["Real", "Integer", "Boolean", "Enumeration", "String", "Binary"]
 
 Values = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -51,7 +51,8 @@ class Variable:
         causality: as in FMI.
         variability: as in FMI.
         unit: SI unit as text, None where the component states none, ``"1"`` for dimensionless.
-        type: how the values are meant; all travel as float64 (booleans 0/1, integers exact to 2⁵³).
+        type: how the values are meant; all travel as float64 (booleans 0/1, integers exact to 2⁵³, texts and
+            binaries as numbers that `components.texts` gives them).
         start: start value, None where there is none.
         description: one line.
         depends_on: for an output, the inputs it depends on directly; None where the component does not say.

@@ -1,14 +1,14 @@
-"""Functional Mock-up Units as components: FMI 2.0 and 3.0 Co-Simulation, loaded through FMPy.
+"""Functional Mock-up Units as components: FMI 1.0, 2.0 and 3.0 Co-Simulation, 2.0 and 3.0 Model Exchange.
 
-All scalar Real, Integer, Boolean and Enumeration variables (FMI 3: floats, integers of every width, Boolean,
-Enumeration) travel as float64. Arrays, strings, binaries and clocks are left out of `variables`; an FMU that
-has some runs all the same, with their start values.
+FMPy loads them. Variables of all types travel as float64, texts and binaries by number (`texts`); arrays are
+taken apart into their elements. Whole numbers beyond 2⁵³ are rounded, with a warning.
 """
 
 from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,57 +16,91 @@ import numpy as np
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
 from exlinn_fmi.components.cache import Lease
-from exlinn_fmi.components.fmu_description import FmuDescription
+from exlinn_fmi.components.fmu_description import FmuDescription, Kind
+from exlinn_fmi.components.fmu_events import Stopped
 from exlinn_fmi.components.fmu_file import check_runnable, read_description, unpack
 from exlinn_fmi.components.fmu_native import (
     Instance,
+    Refused,
     address,
-    make_instance,
     reference_buffer,
     value_buffer,
 )
+from exlinn_fmi.components.fmu_steppers import EventedStep, OwnStep, Stepper
+from exlinn_fmi.components.fmu_values import TEXTS, Group, by_call, groups, start_arrays
+from exlinn_fmi.components.fmu_versions import Instance3, make_instance
 from exlinn_fmi.components.native import Native, NativeAccess
 from exlinn_fmi.components.starts import check_starts, takes_start
-from exlinn_fmi.errors import ComponentError
+from exlinn_fmi.errors import ComponentError, InputError
 
 _STATUS = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 
 
-def read_variables(path: Path, runnable: bool = False) -> tuple[Variable, ...]:
+@dataclass(frozen=True)
+class FmuSettings:
+    """How an FMU is to be used.
+
+    Args:
+        interface: Co-Simulation if the FMU can, else Model Exchange, if not given.
+        solver: for Model Exchange, one of `fmu_exchange.SOLVERS`.
+        tolerance: relative tolerance of the integration; the FMU's own, else 1e-6, if not given.
+        structure: values of structural parameters by name; other names are passed over.
+    """
+
+    interface: Kind | None = None
+    solver: str = "auto"
+    tolerance: float | None = None
+    structure: Mapping[str, float] = field(default_factory=dict)
+
+    def describe(self, path: Path) -> FmuDescription:
+        """The description of an FMU that is used like this.
+
+        Raises:
+            FmuError: it cannot be.
+        """
+        return read_description(Path(path), self.interface, self.structure)
+
+
+def read_variables(
+    path: Path, runnable: bool = False, settings: FmuSettings | None = None
+) -> tuple[Variable, ...]:
     """The variables of an FMU, from its model description alone: nothing is unpacked or loaded.
 
     Args:
         path: the .fmu file.
         runnable: also demand a binary for this platform.
+        settings: how it is to be used.
 
     Raises:
-        FmuError: the file is missing or damaged, or no FMI 2.0 or 3.0 FMU for Co-Simulation.
+        FmuError: the file is missing or damaged, or no FMU that can be used like that.
     """
-    description = read_description(Path(path))
+    description = (settings or FmuSettings()).describe(path)
     if runnable:
         check_runnable(description)
     return description.variables
 
 
 class FmuComponent(Component):
-    """An FMU for Co-Simulation, unpacked into the cache.
+    """An FMU, unpacked into the cache.
 
     Args:
         name: name in the scenario, and of the FMU's instance.
         path: the .fmu file.
+        settings: how it is to be used.
 
     Raises:
         FmuError: the file cannot be used; the message says why and what to do.
         StorageError: there is no room to unpack it.
     """
 
-    def __init__(self, name: str, path: Path) -> None:
+    def __init__(self, name: str, path: Path, settings: FmuSettings | None = None) -> None:
         self.name = name
-        self._description = read_description(Path(path))
-        self.variables = self._description.variables
-        lease = unpack(self._description)
+        self.settings = settings or FmuSettings()
+        self.description = self.settings.describe(path)
+        self.variables = self.description.variables
+        lease = unpack(self.description)
         try:
-            self._instance = make_instance(self._description, lease.folder, name)
+            self._instance = make_instance(self.description, lease.folder, name)
         except BaseException:
             lease.release()
             raise
@@ -74,11 +108,11 @@ class FmuComponent(Component):
         self._phase = "instantiated"
         self._plans: dict[tuple[str, bytes], _Plan] = {}
         self._h = 0.0
+        self._stepper: Stepper = OwnStep(self._instance)
+        self._arrays = start_arrays(self.description)
+        self._held: Values = np.full(len(self.variables), np.nan)
 
-    @property
-    def can_save_state(self) -> bool:
-        """Whether the FMU says so."""
-        return self._description.saves_state
+    # ── initialisation ───────────────────────────────────────────────────────────────────────────────────
 
     def enter_initialization(
         self, start_time: float, stop_time: float, starts: Mapping[str, float]
@@ -89,12 +123,14 @@ class FmuComponent(Component):
             InputError: a name in `starts` is unknown or cannot be set, or a value is not taken.
             FmuError: the FMU refuses to be instantiated again.
         """
-        given = check_starts(self.name, self.variables, starts)
+        given = self._without_structure(check_starts(self.name, self.variables, starts))
         if self._phase != "instantiated":
             self._instance.restart()
-        self._plans.clear()
         self._phase, self._h, self.message = "instantiated", 0.0, ""
-        status = self._check("set up", self._instance.set_up(start_time, stop_time))
+        self._start, self._plans = start_time, {}
+        self._arrays = start_arrays(self.description)
+        self._stepper = self._make_stepper()
+        status = self._check("set up", self._instance.set_up(start_time, stop_time, self.tolerance))
         if given and status < Status.DISCARD:
             indices = np.array(list(given), dtype=np.intp)
             status = max(status, self.set(indices, np.array(list(given.values()))))
@@ -104,11 +140,51 @@ class FmuComponent(Component):
             return status
         return max(status, self._check("EnterInitializationMode", self._instance.enter_initialization()))
 
+    def _without_structure(self, given: dict[int, float]) -> dict[int, float]:
+        """Start values less those of structural parameters, which are set before everything else.
+
+        Raises:
+            InputError: one is not as it was when the variables were listed.
+        """
+        sizing = {k for k, v in enumerate(self.variables) if v.name in self.description.structural}
+        for k in sizing & given.keys():
+            if given[k] != self.variables[k].start:
+                raise InputError(
+                    f"{self.name}.{self.variables[k].name}: sizes arrays and is "
+                    f"{self.variables[k].start:g} since the FMU was opened; give it in the settings"
+                )
+        return {k: value for k, value in given.items() if k not in sizing}
+
+    @property
+    def tolerance(self) -> float | None:
+        """Relative tolerance that is asked for."""
+        if self.settings.tolerance is not None or self.description.interface.kind == "co_simulation":
+            return self.settings.tolerance
+        from exlinn_fmi.components.fmu_exchange import TOLERANCE
+
+        return self.description.tolerance or TOLERANCE
+
+    def _make_stepper(self) -> Stepper:
+        interface = self.description.interface
+        if interface.kind == "model_exchange":
+            from exlinn_fmi.components.fmu_exchange import ModelExchange
+
+            return ModelExchange(self._instance, self.settings.solver, self.tolerance or 0.0)
+        if interface.event_mode and isinstance(self._instance, Instance3):
+            return EventedStep(self._instance)
+        return OwnStep(self._instance)
+
     def exit_initialization(self) -> Status:
-        """Leave Initialization Mode."""
+        """Leave Initialization Mode, and handle the first event where there are events."""
         self._phase = "stepping"
         self._plans.clear()
-        return self._check("ExitInitializationMode", self._instance.exit_initialization())
+        self._held[:] = np.nan
+        status = self._check("ExitInitializationMode", self._instance.exit_initialization())
+        if status >= Status.DISCARD:
+            return status
+        return max(status, self._guarded(lambda: self._stepper.begin(self._start)))
+
+    # ── values ───────────────────────────────────────────────────────────────────────────────────────────
 
     def set(self, indices: Indices, values: Values) -> Status:
         """Set variables, converted to their types."""
@@ -119,9 +195,17 @@ class FmuComponent(Component):
                 if not self._settable(self.variables[k]):
                     self.message = f"{self.variables[k].name} cannot be set while {self._phase}"
                     return Status.ERROR
-            plan = self._plans[key] = _Plan(self._description, self._instance, "Set", indices)
-        worst = Status.OK
-        for group in plan.groups:
+            plan = self._plans[key] = self._plan("Set", indices)
+        worst, doing = Status.OK, plan.groups
+        if self._stepper.has_events and self._phase == "stepping":
+            self._stepper.inputs_changed()
+            if plan.discrete.size and not np.array_equal(
+                self._held[indices[plan.discrete]], values[plan.discrete]
+            ):
+                self._held[indices] = values
+                worst = self._guarded(self._stepper.enter_event_mode)
+                doing = plan.groups + plan.eventful
+        for group in doing:
             refused = group.fill(values)
             if refused is not None:
                 variable = self.variables[indices[refused]]
@@ -137,34 +221,126 @@ class FmuComponent(Component):
         key = ("Get", indices.tobytes())
         plan = self._plans.get(key)
         if plan is None:
-            plan = self._plans[key] = _Plan(self._description, self._instance, "Get", indices)
+            plan = self._plans[key] = self._plan("Get", indices)
         worst = Status.OK
+        if self._stepper.has_events and self._phase == "stepping":
+            worst = self._guarded(self._stepper.settle)
         for group in plan.groups:
             code = group.function(*group.arguments)
             if code:
                 worst = max(worst, self._check(f"Get{group.accessor}", code))
-            values[group.positions] = group.buffer
+                if code >= Status.DISCARD and group.accessor in TEXTS:
+                    continue  # what its pointers point to is anybody's guess
+            inexact = group.take(values)
+            if inexact is not None:
+                self.message = (
+                    f"{self.variables[indices[inexact]].name} is a whole number beyond 2^53 and was rounded"
+                )
+                worst = max(worst, Status.WARNING)
         return worst
 
+    def _plan(self, verb: str, indices: Indices) -> _Plan:
+        """The C calls for these variables."""
+        stepping = self._phase == "stepping" and self._stepper.has_events and verb == "Set"
+        waits = np.array([stepping and self._waits(self.variables[k]) for k in indices], dtype=bool)
+        eventful, at_once = np.flatnonzero(waits), np.flatnonzero(~waits)
+        everything = self.description, self._instance, self._arrays, verb, indices
+        return _Plan(groups(*everything, at_once), groups(*everything, eventful), eventful)
+
+    def _waits(self, variable: Variable) -> bool:
+        """Whether a variable may be set in Event Mode alone, once stepping."""
+        return not (variable.causality == "input" and variable.variability == "continuous")
+
+    def _settable(self, variable: Variable) -> bool:
+        """As the FMI state machines have it for the phase."""
+        if self._phase != "stepping":
+            return takes_start(variable)
+        tunable = variable.causality == "parameter" and variable.variability == "tunable"
+        return tunable or variable.causality == "input"
+
+    # ── stepping ─────────────────────────────────────────────────────────────────────────────────────────
+
     def step(self, t: float, h: float) -> Status:
-        """DoStep."""
-        if self._description.equal_steps and abs(h - (self._h or h)) > 1e-9 * h:
+        """DoStep, or integration where it is Model Exchange."""
+        if self.description.interface.equal_steps and abs(h - (self._h or h)) > 1e-9 * h:
             self.message = f"takes equal communication steps only: had {self._h:g} s, now {h:g} s"
             return Status.ERROR
         self._h = h
-        code = self._instance.do_step(t, h)
+        try:
+            code = self._stepper.step(t, h)
+        except (Refused, Stopped) as problem:
+            return self._trouble(problem)
         return Status.OK if code == 0 else self._check("DoStep", code)
 
-    def native(self) -> Native:
-        """The FMU's own functions."""
-        return _FmuNative(self)
+    @property
+    def takes_input_derivatives(self) -> bool:
+        """Whether `set_input_derivatives` works."""
+        interface = self.description.interface
+        return interface.kind == "model_exchange" or interface.input_derivatives
+
+    def set_input_derivatives(self, indices: Indices, derivatives: Values) -> Status:
+        """Let continuous inputs change over the next step, from the values set last.
+
+        Args:
+            indices: (k,) of the inputs, all continuous and of type Real or Float64.
+            derivatives: [unit/s] (k,) first derivatives.
+        """
+        references = self._references(indices)
+        if self.description.interface.kind == "co_simulation":
+            values = np.ascontiguousarray(derivatives, dtype=float)
+            return self._guarded(lambda: self._instance.set_input_derivatives(references, 1, values))
+        from exlinn_fmi.components.fmu_exchange import ModelExchange
+
+        assert isinstance(self._stepper, ModelExchange)
+        present = np.zeros(len(indices))
+        status = self.get(indices, present)
+        self._stepper.set_derivatives(references, present, np.array(derivatives, dtype=float))
+        return status
+
+    @property
+    def gives_directional_derivatives(self) -> bool:
+        """Whether `directional_derivative` works."""
+        return self.description.interface.directional_derivatives
+
+    def directional_derivative(self, unknowns: Indices, knowns: Indices, seed: Values) -> Values:
+        """∂(unknowns)/∂(knowns) · seed at the present point, all of type Real or Float64.
+
+        Args:
+            unknowns: (n,) indices of outputs or state derivatives.
+            knowns: (k,) indices of inputs or states.
+            seed: (k,) direction.
+
+        Returns:
+            (n,) the change of the unknowns.
+
+        Raises:
+            ComponentError: the FMU reports an error.
+        """
+        of, to = self._references(unknowns), self._references(knowns)
+        result = np.zeros(len(unknowns))
+        try:
+            self._instance.directional_derivative(of, to, np.ascontiguousarray(seed, dtype=float), result)
+        except Refused as problem:
+            self._trouble(problem)
+            raise ComponentError(self.name, self.message) from problem
+        return result
+
+    def _references(self, indices: Indices) -> Any:
+        """Value references of variables, as C wants them."""
+        return reference_buffer([self.description.references[k] for k in indices])
+
+    def native(self) -> Native | None:
+        """The FMU's own functions, where a step is one of them and no texts or binaries may travel."""
+        texts = any(v.type in TEXTS and v.causality in ("input", "output") for v in self.variables)
+        return None if texts or not isinstance(self._stepper, OwnStep) else _FmuNative(self)
 
     def calls(self, verb: Literal["Get", "Set"], indices: Indices) -> list[NativeAccess]:
         """The C calls that get or set these variables, one per type."""
         found = []
-        for accessor, positions in _by_accessor(self._description, indices).items():
-            references = reference_buffer([self._description.references[indices[p]] for p in positions])
-            buffer = value_buffer(self._description, accessor, 0)
+        for (accessor, array), positions in by_call(self.description, indices).items():
+            whole = None if array is None else self._arrays[accessor, array]
+            references = self._references(indices[positions] if array is None else indices[positions[:1]])
+            buffer = value_buffer(self.description, accessor, 0)
             function, arguments = self._instance.accessor(verb, accessor, references, buffer)
             found.append(
                 NativeAccess(
@@ -176,9 +352,25 @@ class FmuComponent(Component):
                     boolean=accessor == "Boolean",
                     counted=len(arguments) > 4,
                     positions=np.array(positions, dtype=np.intp),
+                    array=whole if verb == "Set" or whole is None else whole.copy(),
+                    elements=np.array([self.description.elements[k] for k in indices[positions]])
+                    if array is not None
+                    else None,
                 )
             )
         return found
+
+    # ── state ────────────────────────────────────────────────────────────────────────────────────────────
+
+    @property
+    def can_save_state(self) -> bool:
+        """Whether the FMU says so."""
+        return self.description.interface.saves_state
+
+    @property
+    def can_serialize_state(self) -> bool:
+        """Whether `serialize_state` works: the state is all in the FMU, which can turn it into bytes."""
+        return self.description.interface.serializes_state and isinstance(self._stepper, OwnStep)
 
     def save_state(self) -> object:
         """The FMU's own copy of its state, freed when the object returned is dropped.
@@ -186,8 +378,10 @@ class FmuComponent(Component):
         Raises:
             ComponentError: the FMU reports an error.
         """
+        if self._phase == "stepping" and self._guarded(self._stepper.settle) >= Status.DISCARD:
+            raise ComponentError(self.name, f"saving the state failed: {self.message}")
         try:
-            return _SavedState(self._instance)
+            return _SavedState(self._instance, self._stepper.snapshot(), self._held.copy())
         except RuntimeError as error:
             raise ComponentError(self.name, f"saving the state failed: {error}") from error
 
@@ -204,25 +398,63 @@ class FmuComponent(Component):
             self._instance.set_state(state.pointer)
         except RuntimeError as error:
             raise ComponentError(self.name, f"restoring the state failed: {error}") from error
+        self._stepper.restore(state.snapshot)
+        self._held[:] = state.held
+
+    def serialize_state(self, state: object) -> bytes:
+        """A state that `save_state` returned, as bytes.
+
+        Raises:
+            ComponentError: the FMU reports an error.
+        """
+        assert isinstance(state, _SavedState)
+        try:
+            return self._instance.serialize(state.pointer)
+        except Refused as problem:
+            self._trouble(problem)
+            raise ComponentError(self.name, f"serialising the state failed: {self.message}") from problem
+
+    def deserialize_state(self, data: bytes) -> object:
+        """A state for `restore_state`, of bytes that `serialize_state` gave in any run of this FMU.
+
+        Raises:
+            ComponentError: the FMU reports an error.
+        """
+        try:
+            pointer = self._instance.deserialize(data)
+        except Refused as problem:
+            self._trouble(problem)
+            raise ComponentError(self.name, f"deserialising the state failed: {self.message}") from problem
+        return _SavedState(self._instance, self._stepper.snapshot(), self._held.copy(), pointer)
 
     def close(self) -> None:
         """Terminate and free the instance, unload the binary, give the folder back."""
         self._plans.clear()
         self._release()
 
-    def _settable(self, variable: Variable) -> bool:
-        """As the FMI state machines have it for the phase."""
-        if self._phase != "stepping":
-            return takes_start(variable)
-        tunable = variable.causality == "parameter" and variable.variability == "tunable"
-        return tunable or variable.causality == "input"
+    # ── trouble ──────────────────────────────────────────────────────────────────────────────────────────
+
+    def _guarded(self, action: Callable[[], object]) -> Status:
+        """Do something that the FMU may refuse; OK or what came of it."""
+        try:
+            action()
+        except (Refused, Stopped) as problem:
+            return self._trouble(problem)
+        return Status.OK
+
+    def _trouble(self, problem: Refused | Stopped) -> Status:
+        """What went wrong as a status, with a message."""
+        if isinstance(problem, Refused):
+            return self._check(problem.function, problem.code)
+        self.message = problem.message
+        return Status(problem.code)
 
     def _check(self, function: str, code: int) -> Status:
         """A code of the FMU as a status, with a message where it is not OK."""
         if code == 0:
             return Status.OK
         self._instance.code(code)
-        prefix = self._instance.prefix
+        prefix = f"fmi{self.description.version if self.description.version > 1 else ''}"
         word = f"{prefix}{_STATUS[code]}" if 0 <= code < len(_STATUS) else f"the unknown status {code}"
         said = self._instance.remark or self._instance.said()
         self._instance.remark = ""
@@ -231,58 +463,19 @@ class FmuComponent(Component):
         return Status(code) if 0 <= code <= Status.FATAL else Status.ERROR
 
 
+@dataclass
 class _Plan:
-    """The C calls that get or set one set of variables: one group per accessor, all buffers ready."""
+    """The C calls that get or set one set of variables.
 
-    def __init__(self, description: FmuDescription, instance: Instance, verb: str, indices: Indices) -> None:
-        self.groups = [
-            _Group(description, instance, verb, accessor, indices, where)
-            for accessor, where in _by_accessor(description, indices).items()
-        ]
+    Args:
+        groups: calls to make at once.
+        eventful: calls to set what may be set in Event Mode alone.
+        discrete: positions of the values of `eventful`.
+    """
 
-
-def _by_accessor(description: FmuDescription, indices: Indices) -> dict[str, list[int]]:
-    """Positions in `indices` by accessor."""
-    positions: dict[str, list[int]] = {}
-    for position, k in enumerate(indices):
-        positions.setdefault(description.accessors[k], []).append(position)
-    return positions
-
-
-class _Group:
-    """One C call: its function, its arguments and the buffer that they point to."""
-
-    def __init__(
-        self,
-        description: FmuDescription,
-        instance: Instance,
-        verb: str,
-        accessor: str,
-        indices: Indices,
-        positions: list[int],
-    ) -> None:
-        alone = len(positions) == len(indices)
-        self.accessor = accessor
-        self.positions: Any = slice(None) if alone else np.array(positions, dtype=np.intp)
-        self.buffer = value_buffer(description, accessor, len(positions))
-        self._references = reference_buffer([description.references[indices[p]] for p in positions])
-        self.function: Callable[..., int]
-        self.function, self.arguments = instance.accessor(verb, accessor, self._references, self.buffer)
-        self._double = self.buffer.dtype == np.float64
-        self._boolean = accessor == "Boolean"
-
-    def fill(self, values: Values) -> int | None:
-        """Put values into the buffer; gives the position of the first that its type cannot hold."""
-        given = values[self.positions]
-        if self._double:
-            self.buffer[:] = given
-            return None
-        with np.errstate(invalid="ignore", over="ignore"):
-            self.buffer[:] = given.astype(bool) if self._boolean else given
-        if self.buffer.dtype == np.float32:
-            return None
-        refused = np.flatnonzero(self.buffer != given)
-        return int(np.arange(len(values))[self.positions][refused[0]]) if refused.size else None
+    groups: list[Group]
+    eventful: list[Group]
+    discrete: Indices
 
 
 class _FmuNative(Native):
@@ -304,8 +497,9 @@ class _FmuNative(Native):
 class _SavedState:
     """A state saved by an FMU, freed with this object."""
 
-    def __init__(self, instance: Instance) -> None:
-        self.pointer, self.generation = instance.get_state(), instance.generation
+    def __init__(self, instance: Instance, snapshot: Any, held: Values, pointer: int | None = None) -> None:
+        self.pointer = instance.get_state() if pointer is None else pointer
+        self.generation, self.snapshot, self.held = instance.generation, snapshot, held
         weakref.finalize(self, _free_state, instance, self.generation, self.pointer).atexit = False
 
 

@@ -1,17 +1,32 @@
-"""What an FMU says of itself: its model description, as FMPy reads it, in our words."""
+"""What an FMU says of itself: its model description, as FMPy reads it, in our words.
+
+Arrays are taken apart: each element is a variable of its own, ``x[1]``, ``A[2,1]``, counted from 1. Their
+sizes may come from structural parameters, whose values are therefore needed to list the variables at all.
+"""
 
 from __future__ import annotations
 
+import itertools
+import math
 import re
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+from xml.etree import ElementTree
 
 import fmpy
 
 from exlinn_fmi.components.base import Causality, Variability, Variable, VariableType
+from exlinn_fmi.components.texts import handle
 from exlinn_fmi.errors import FmuError
+
+Kind = Literal["co_simulation", "model_exchange"]
+KINDS: tuple[Kind, ...] = ("co_simulation", "model_exchange")
+
+MOST_ELEMENTS = 1_000_000
+"""Elements of all arrays together that an FMU may have."""
 
 _Key = tuple[str, int]
 """Accessor and value reference of a variable."""
@@ -25,124 +40,404 @@ _TYPES: dict[str, VariableType] = {
     **dict.fromkeys(_INTEGERS, "Integer"),
     "Boolean": "Boolean",
     "Enumeration": "Enumeration",
+    "String": "String",
+    "Binary": "Binary",
 }
 
 
 @dataclass(frozen=True)
+class Interface:
+    """One of the ways in which an FMU can be used, and what it is capable of then.
+
+    Args:
+        kind: which way.
+        identifier: name of the binary.
+        equal_steps: whether all communication steps must be equally long.
+        saves_state: whether its state can be saved and restored.
+        serializes_state: whether a saved state can be turned into bytes.
+        directional_derivatives: whether it gives directional derivatives.
+        once: whether the binary may be instantiated only once per process.
+        needs_tool: whether it needs the tool that made it.
+        input_derivatives: whether Co-Simulation takes derivatives of inputs (FMI 1 and 2).
+        output_derivatives: order up to which Co-Simulation gives derivatives of outputs.
+        event_mode: whether Co-Simulation can stop for events (FMI 3).
+        intermediate_update: whether Co-Simulation calls back within a step (FMI 3).
+        completed_step: whether Model Exchange wants to hear of every step of the solver.
+    """
+
+    kind: Kind
+    identifier: str
+    equal_steps: bool = False
+    saves_state: bool = False
+    serializes_state: bool = False
+    directional_derivatives: bool = False
+    once: bool = False
+    needs_tool: bool = False
+    input_derivatives: bool = False
+    output_derivatives: int = 0
+    event_mode: bool = False
+    intermediate_update: bool = False
+    completed_step: bool = True
+
+
+@dataclass(frozen=True)
+class Clock:
+    """A clock of an FMI 3 FMU.
+
+    Args:
+        name: its name.
+        reference: its value reference.
+        causality: as in FMI.
+        kind: its interval variability: ``constant``, ``fixed``, ``tunable``, ``changing``, ``countdown`` or
+            ``triggered``.
+        interval: [s] where the description states one.
+        shift: [s] time of the first tick.
+    """
+
+    name: str
+    reference: int
+    causality: str
+    kind: str
+    interval: float | None
+    shift: float
+
+
+@dataclass(frozen=True)
+class StateNames:
+    """Continuous states of Model Exchange, where the model description tells them one by one.
+
+    Args:
+        references: value references of the states.
+        rates: value references of their derivatives.
+    """
+
+    references: tuple[int, ...] = ()
+    rates: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
 class FmuDescription:
-    """What an FMU says of itself, as far as a Co-Simulation master needs it.
+    """What an FMU says of itself, as far as a master needs it, for one way of using it.
 
     Args:
         path: the file.
         version: FMI major version.
-        identifier: name of the binary.
-        token: GUID (FMI 2) or instantiation token (FMI 3).
-        variables: its scalar numeric variables; arrays, strings, binaries and clocks are left out.
+        interface: how it is used.
+        interfaces: all ways in which it can be used.
+        token: GUID (FMI 1 and 2) or instantiation token (FMI 3).
+        tool: the tool that made it.
+        variables: its variables, arrays element by element; clocks are left out.
         accessors: for each variable, the name of its get and set functions less the prefix, e.g. ``Real``.
         references: for each variable, its value reference.
-        equal_steps: whether all communication steps must be equally long.
-        saves_state: whether its state can be saved and restored.
-        once: whether the binary may be instantiated only once per process.
-        tool: the tool that must be installed for it to run, None where none is needed.
+        elements: for each variable, its place in the array that the reference stands for, 0 for a scalar.
+        sizes: for each variable, the number of elements that its reference stands for.
+        arrays: dimensions of the arrays, by name.
+        structural: names of structural parameters.
+        structure: value references and values of structural parameters that differ from the description's.
+        states: continuous states and their derivatives; none where arrays are among them.
+        state_count: number of continuous states; FMI 3 FMUs are asked for it.
+        indicator_count: number of event indicators; FMI 3 FMUs are asked for it.
+        clocks: its clocks.
+        tolerance: relative tolerance of its default experiment, None where it states none.
         log_categories: names of the log categories that it has.
     """
 
     path: Path
-    version: Literal[2, 3]
-    identifier: str
+    version: Literal[1, 2, 3]
+    interface: Interface
+    interfaces: tuple[Interface, ...]
     token: str
+    tool: str
     variables: tuple[Variable, ...]
     accessors: tuple[str, ...]
     references: tuple[int, ...]
-    equal_steps: bool
-    saves_state: bool
-    once: bool
-    tool: str | None
-    log_categories: tuple[str, ...]
+    elements: tuple[int, ...]
+    sizes: tuple[int, ...]
+    arrays: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    structural: frozenset[str] = frozenset()
+    structure: Mapping[_Key, float] = field(default_factory=dict)
+    states: StateNames = StateNames()
+    state_count: int = 0
+    indicator_count: int = 0
+    clocks: tuple[Clock, ...] = ()
+    tolerance: float | None = None
+    log_categories: tuple[str, ...] = ()
+
+    @property
+    def identifier(self) -> str:
+        """Name of the binary."""
+        return self.interface.identifier
 
     @property
     def platform(self) -> str:
         """Name of this machine's folder in ``binaries``."""
-        return str(fmpy.platform if self.version == 2 else fmpy.platform_tuple)
+        return str(fmpy.platform_tuple if self.version == 3 else fmpy.platform)
 
 
-def describe(path: Path, model: Any) -> FmuDescription:
+def describe(
+    path: Path,
+    model: Any,
+    root: ElementTree.Element,
+    kind: Kind | None = None,
+    starts: Mapping[str, float] | None = None,
+) -> FmuDescription:
     """Our description from FMPy's.
+
+    Args:
+        path: the file.
+        model: as FMPy reads it.
+        root: the XML, for what FMPy does not read.
+        kind: how the FMU is to be used; Co-Simulation if it can, else Model Exchange, if not given.
+        starts: start values by name; those of structural parameters decide on the sizes of arrays.
 
     Raises:
         FmuError: something in it cannot be used.
     """
-    use = model.coSimulation
-    identifier = use.modelIdentifier or ""
-    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,199}", identifier):
-        raise FmuError(f"{path}: the model identifier {identifier!r} is no C identifier, as FMI demands")
-    scalars = [v for v in model.modelVariables if v.type in _TYPES and not v.dimensions]
-    names = [v.name for v in scalars]
+    version: Literal[1, 2, 3] = {"1": 1, "2": 2}.get(model.fmiVersion[0], 3)  # type: ignore[assignment]
+    interfaces = tuple(_interfaces(path, version, model, root))
+    interface = _choose(path, version, interfaces, kind, model)
+    structure = {
+        v.name: float((starts or {}).get(v.name, v.start))
+        for v in model.modelVariables
+        if v.causality == "structuralParameter" and v.start is not None
+    }
+    negated = {v.get("name") for v in root.iterfind("ModelVariables/*[@variableAlias='negatedAlias']")}
+    known = [v for v in model.modelVariables if v.type in _TYPES and v.name not in negated]
+    parts = list(_parts(path, version, known, structure, root))
+    names = [variable.name for variable, _, _, _ in parts]
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)
         raise FmuError(f"{path}: two variables are called {twice!r}")
-    version: Literal[2, 3] = 2 if model.fmiVersion == "2.0" else 3
-    enumeration = "Integer" if version == 2 else "Int64"
-
-    def key(v: Any) -> _Key:
-        """Value references of FMI 2 are unique within a type only; aliases share one."""
-        return enumeration if v.type == "Enumeration" else v.type, v.valueReference
-
-    inputs = {key(v): v.name for v in reversed(scalars) if v.causality == "input"}
-    depends: dict[_Key, tuple[str, ...] | None] = {}
-    for unknown in model.outputs:
-        said = unknown.dependencies
-        direct = None if said is None else dict.fromkeys(inputs[key(d)] for d in said if key(d) in inputs)
-        depends[key(unknown.variable)] = None if direct is None else tuple(direct)
+    variables, keys, elements, sizes = (
+        zip(*_with_dependencies(version, model, parts), strict=True) if parts else ([],) * 4
+    )
+    states, rates = _states(version, model)
+    default = model.defaultExperiment
     return FmuDescription(
         path=path,
         version=version,
-        identifier=identifier,
+        interface=interface,
+        interfaces=interfaces,
         token=model.guid or "",
-        variables=tuple(_variable(path, v, depends.get(key(v))) for v in scalars),
-        accessors=tuple(key(v)[0] for v in scalars),
-        references=tuple(key(v)[1] for v in scalars),
-        equal_steps=not use.canHandleVariableCommunicationStepSize,
-        saves_state=use.canGetAndSetFMUstate,
-        once=use.canBeInstantiatedOnlyOncePerProcess,
-        tool=(model.generationTool or "the tool that made it") if use.needsExecutionTool else None,
+        tool=model.generationTool or "the tool that made it",
+        variables=tuple(variables),
+        accessors=tuple(key[0] for key in keys),
+        references=tuple(key[1] for key in keys),
+        elements=tuple(elements),
+        sizes=tuple(sizes),
+        arrays={v.name: _shape(v, structure) for v in known if v.dimensions},
+        structural=frozenset(structure),
+        structure={
+            _key(version, v): structure[v.name]
+            for v in known
+            if v.name in structure and structure[v.name] != float(v.start)
+        },
+        states=StateNames(states, rates),
+        state_count=model.numberOfContinuousStates,
+        indicator_count=model.numberOfEventIndicators,
+        clocks=tuple(_clocks(root)),
+        tolerance=float(default.tolerance) if default is not None and default.tolerance else None,
         log_categories=tuple(category.name for category in model.logCategories),
     )
 
 
-def _variable(path: Path, v: Any, depends_on: tuple[str, ...] | None) -> Variable:
-    """One variable in our words.
+# ── interfaces ───────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _interfaces(path: Path, version: int, model: Any, root: ElementTree.Element) -> Iterator[Interface]:
+    """What the FMU can be used as.
 
     Raises:
-        FmuError: its start value or range is no number.
+        FmuError: a binary's name is no file name.
+    """
+    for kind, use in zip(KINDS, (model.coSimulation, model.modelExchange), strict=True):
+        if use is None or (version == 1 and kind == "model_exchange"):
+            continue
+        identifier = use.modelIdentifier or ""
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,199}", identifier):
+            raise FmuError(f"{path}: the model identifier {identifier!r} is no C identifier, as FMI demands")
+        element = root.find("Implementation//Capabilities" if version == 1 else _TAGS[kind])
+
+        def says(attribute: str, element: ElementTree.Element | None = element) -> bool:
+            return element is not None and element.get(attribute) in ("true", "1")
+
+        state = "State" if version == 3 else "state"
+        plural = "s" if version == 3 else ""
+        yield Interface(
+            kind=kind,
+            identifier=identifier,
+            equal_steps=kind == "co_simulation" and not says("canHandleVariableCommunicationStepSize"),
+            saves_state=says(f"canGetAndSetFMU{state}"),
+            serializes_state=says(f"canSerializeFMU{state}"),
+            directional_derivatives=says(f"providesDirectionalDerivative{plural}"),
+            once=says("canBeInstantiatedOnlyOncePerProcess"),
+            needs_tool=says("needsExecutionTool"),
+            input_derivatives=says("canInterpolateInputs"),
+            output_derivatives=int(
+                (element.get("maxOutputDerivativeOrder") if element is not None else 0) or 0
+            ),
+            event_mode=says("hasEventMode"),
+            intermediate_update=says("providesIntermediateUpdate"),
+            completed_step=says("needsCompletedIntegratorStep")
+            if version == 3
+            else not says("completedIntegratorStepNotNeeded"),
+        )
+
+
+_TAGS = {"co_simulation": "CoSimulation", "model_exchange": "ModelExchange"}
+_WORDS = {"co_simulation": "Co-Simulation", "model_exchange": "Model Exchange"}
+
+
+def _choose(
+    path: Path, version: int, interfaces: Sequence[Interface], kind: Kind | None, model: Any
+) -> Interface:
+    """The interface to use.
+
+    Raises:
+        FmuError: it does not have it.
+    """
+    for interface in interfaces:
+        if kind in (None, interface.kind):
+            return interface
+    found = [_WORDS[interface.kind] for interface in interfaces]
+    if model.scheduledExecution is not None:
+        found.append("Scheduled Execution")
+    if version == 1 and model.modelExchange is not None:
+        found.append("Model Exchange of FMI 1.0")
+    there = f"it is for {' and '.join(found)} only" if found else "it names no kind of use"
+    wanted = _WORDS[kind] if kind else "Co-Simulation and no Model Exchange of FMI 2.0 or 3.0"
+    raise FmuError(
+        f"{path}: no {wanted}: {there}; export it again for {_WORDS[kind or 'co_simulation']}"
+        + (", or change `interface`" if kind and interfaces else "")
+    )
+
+
+# ── variables ────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _key(version: int, v: Any) -> _Key:
+    """Value references of FMI 1 and 2 are unique within a type only; aliases share one."""
+    return ("Int64" if version == 3 else "Integer") if v.type == "Enumeration" else v.type, v.valueReference
+
+
+def _shape(v: Any, structure: Mapping[str, float]) -> tuple[int, ...]:
+    """Dimensions of an array; none for a scalar."""
+    return tuple(
+        int(d.start) if d.start is not None else int(structure[d.variable.name]) for d in v.dimensions
+    )
+
+
+_Part = tuple[Variable, _Key, int, int]
+
+
+def _parts(
+    path: Path, version: int, known: Iterable[Any], structure: Mapping[str, float], root: ElementTree.Element
+) -> Iterator[_Part]:
+    """Every scalar and every element of an array: variable, key, place and size.
+
+    Raises:
+        FmuError: a start value or range is no number, or arrays are too large.
+    """
+    total = 0
+    texts = {
+        e.get("name"): [s.get("value") or "" for s in e.findall("Start")]
+        for tag in ("String", "Binary")
+        for e in root.iterfind(f"ModelVariables/{tag}")
+    }
+    for v in known:
+        shape = _shape(v, structure)
+        size = math.prod(shape)
+        total += size
+        if size < 0 or total > MOST_ELEMENTS:
+            raise FmuError(f"{path}: variable {v.name!r} has dimensions {shape}: more than can be held")
+        try:
+            given = texts[v.name] if v.name in texts else (v.start or "").split() if shape else [v.start]
+            starts: list[float | None] = [_start(v, text) for text in given]
+            if len(starts) != size:
+                starts = starts * size if len(starts) == 1 else [None] * size
+            if v.causality == "structuralParameter":
+                starts = [structure[v.name]]
+            one = _variable(v)
+        except ValueError as error:
+            raise FmuError(f"{path}: variable {v.name!r} (line {v.sourceline}): {error}") from error
+        for k, place in enumerate(itertools.product(*(range(1, n + 1) for n in shape))):
+            name = f"{v.name}[{','.join(map(str, place))}]" if shape else v.name
+            yield one(name, starts[k]), _key(version, v), k, size
+
+
+def _start(v: Any, text: str | None) -> float | None:
+    if text is None:
+        return None
+    if v.type == "String":
+        return handle(text)
+    return handle(bytes.fromhex(text)) if v.type == "Binary" else _number(text)
+
+
+def _variable(v: Any) -> Any:
+    """What makes a variable of a name and a start value, all else as the description has it.
+
+    Raises:
+        ValueError: its range is no number.
     """
     declared = v.declaredType
     causality: Causality = v.causality
     variability: Variability = v.variability
-    if v.causality == "calculatedParameter":
+    if v.causality in ("calculatedParameter", "none"):
         causality = "local"
     elif v.causality == "structuralParameter":
-        # It sizes arrays, and could only change in configuration mode, which we do not enter.
-        causality, variability = "local", "constant"
+        causality, variability = "parameter", "fixed"
+    elif v.causality == "input" and getattr(v, "clocks", None):
+        causality = "local"  # it may be set in the instant of its clock's tick alone
     low, high = v.min or getattr(declared, "min", None), v.max or getattr(declared, "max", None)
     if v.type == "Enumeration" and declared is not None and declared.items:
         items = [int(item.value) for item in declared.items]
         low, high = min(items), max(items)
-    try:
+    unit = v.unit or getattr(declared, "unit", None)
+    least, most = _number(low), _number(high)
+
+    def make(name: str, start: float | None) -> Variable:
         return Variable(
-            name=v.name,
+            name=name,
             causality=causality,
             variability=variability,
-            unit=v.unit or getattr(declared, "unit", None),
+            unit=unit,
             type=_TYPES[v.type],
-            start=_number(v.start),
+            start=start,
             description=v.description or "",
-            depends_on=depends_on if causality == "output" else (),
-            min=_number(low),
-            max=_number(high),
+            min=least,
+            max=most,
         )
-    except ValueError as error:
-        raise FmuError(f"{path}: variable {v.name!r} (line {v.sourceline}): {error}") from error
+
+    return make
+
+
+def _with_dependencies(version: int, model: Any, parts: Sequence[_Part]) -> Iterator[_Part]:
+    """The parts, with the inputs that each output depends on directly; an array depends as a whole."""
+    inputs: dict[_Key, list[str]] = {}
+    seen: set[tuple[_Key, int]] = set()
+    for variable, key, place, _ in parts:
+        if variable.causality == "input" and (key, place) not in seen:  # the first of several aliases
+            seen.add((key, place))
+            inputs.setdefault(key, []).append(variable.name)
+    depends: dict[_Key, tuple[str, ...] | None] = {}
+    for unknown in model.outputs:
+        said = unknown.dependencies
+        names = (
+            None if said is None else dict.fromkeys(n for d in said for n in inputs.get(_key(version, d), ()))
+        )
+        depends[_key(version, unknown.variable)] = None if names is None else tuple(names)
+    for variable, key, place, size in parts:
+        if variable.causality == "output":
+            variable = Variable(**{**variable.__dict__, "depends_on": depends.get(key)})
+        yield variable, key, place, size
+
+
+def _states(version: int, model: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Value references of states and their derivatives, none where arrays are among them."""
+    rates = [u.variable for u in model.derivatives]
+    if any(v.dimensions or v.derivative is None for v in rates):
+        return (), ()
+    return tuple(v.derivative.valueReference for v in rates), tuple(v.valueReference for v in rates)
 
 
 def _number(text: str | int | None) -> float | None:
@@ -150,3 +445,27 @@ def _number(text: str | int | None) -> float | None:
     if text is None:
         return None
     return {"true": 1.0, "false": 0.0}[text] if text in ("true", "false") else float(text)
+
+
+# ── clocks ───────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _clocks(root: ElementTree.Element) -> Iterator[Clock]:
+    """The clocks, with intervals in seconds."""
+    for element in root.iterfind("ModelVariables/Clock"):
+        resolution = float(element.get("resolution", "1"))
+
+        def seconds(name: str, e: ElementTree.Element = element, r: float = resolution) -> float | None:
+            if (decimal := e.get(f"{name}Decimal")) is not None:
+                return float(decimal)
+            counter = e.get(f"{name}Counter")
+            return None if counter is None else float(counter) / r
+
+        yield Clock(
+            element.get("name", ""),
+            int(element.get("valueReference", "0")),
+            element.get("causality", "local"),
+            element.get("intervalVariability", "triggered"),
+            seconds("interval"),
+            seconds("shift") or 0.0,
+        )

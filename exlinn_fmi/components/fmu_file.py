@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
@@ -17,7 +17,7 @@ import fmpy
 
 from exlinn_fmi.components.archive import extract, open_archive, parse_xml, read_member
 from exlinn_fmi.components.cache import Lease, lease
-from exlinn_fmi.components.fmu_description import FmuDescription, describe
+from exlinn_fmi.components.fmu_description import FmuDescription, Kind, describe
 from exlinn_fmi.errors import FmuError, StorageError
 
 DESCRIPTION = "modelDescription.xml"
@@ -28,18 +28,28 @@ LARGEST_EXPLAINED = 2**20
 """Bytes of XML that are validated to explain what is wrong: the time grows with the square of the size."""
 
 
-def read_description(path: Path) -> FmuDescription:
+def read_description(
+    path: Path, kind: Kind | None = None, structure: Mapping[str, float] | None = None
+) -> FmuDescription:
     """Read an FMU's model description; nothing is unpacked or loaded.
 
+    Args:
+        path: the file.
+        kind: how the FMU is to be used; Co-Simulation if it can, else Model Exchange, if not given.
+        structure: values of structural parameters by name, which decide on the sizes of arrays.
+
     Raises:
-        FmuError: the file is missing or damaged, or no FMI 2.0 or 3.0 FMU for Co-Simulation.
+        FmuError: the file is missing or damaged, or no FMU that can be used like that.
     """
     stamp = path.stat() if path.is_file() else None
-    return _read_description(path, stamp and (stamp.st_mtime_ns, stamp.st_size))
+    sizes = tuple(sorted((structure or {}).items()))
+    return _read_description(path, stamp and (stamp.st_mtime_ns, stamp.st_size), kind, sizes)
 
 
 @lru_cache(maxsize=8)
-def _read_description(path: Path, stamp: tuple[int, int] | None) -> FmuDescription:
+def _read_description(
+    path: Path, stamp: tuple[int, int] | None, kind: Kind | None, structure: tuple[tuple[str, float], ...]
+) -> FmuDescription:
     """A large description takes seconds, and is asked for by the checks and again by the run."""
     with open_archive(path) as archive:
         data = read_member(path, archive, DESCRIPTION)
@@ -47,16 +57,13 @@ def _read_description(path: Path, stamp: tuple[int, int] | None) -> FmuDescripti
     version = root.get("fmiVersion", "")
     if root.tag != "fmiModelDescription" or not version:
         raise FmuError(f"{path}: {DESCRIPTION} begins with <{root.tag}>, expected <fmiModelDescription>")
-    if version != "2.0" and not re.match(r"3\.\d", version):
+    if version not in ("1.0", "2.0") and not re.match(r"3\.\d", version):
         raise FmuError(
-            f"{path}: FMI version {version}; expected 2.0 or 3.0: export it again for one of these"
+            f"{path}: FMI version {version}; expected 1.0, 2.0 or 3.0: export it again for one of these"
         )
-    kinds = [kind for kind in ("ModelExchange", "ScheduledExecution") if root.find(kind) is not None]
-    if root.find("CoSimulation") is None:
-        found = f"it is for {' and '.join(kinds)} only" if kinds else "it names no kind of use"
-        raise FmuError(f"{path}: no Co-Simulation: {found}; export it again for Co-Simulation")
     try:
-        return describe(path, fmpy.read_model_description(str(path), validate=False))
+        model = fmpy.read_model_description(str(path), validate=False)
+        return describe(path, model, root, kind, dict(structure))
     except FmuError:
         raise
     except Exception as error:  # FMPy reads what follows the schema; all else fails somewhere in it
@@ -97,7 +104,7 @@ def unpack(description: FmuDescription) -> Lease:
     try:
         with path.open("rb") as file:
             content = hashlib.file_digest(file, "sha256").hexdigest()
-        return lease(f"{content[:32]}-{description.platform}", fill, alone=description.once)
+        return lease(f"{content[:32]}-{description.platform}", fill, alone=description.interface.once)
     except OSError as error:
         raise StorageError(f"{path}: cannot be unpacked: {error}") from error
 

@@ -1,8 +1,8 @@
-"""One instance of an FMU's binary: the C functions of FMI 2.0 and 3.0 Co-Simulation under the same few names.
+"""One instance of an FMU's binary: the C functions of all FMI versions under the same few names.
 
 FMPy loads the binary and has the types; the calls of the hot path go straight to the C functions, with
-addresses of buffers that live as long as the plan they belong to. Codes returned are those of fmi2Status and
-fmi3Status, which agree; `remark` says what a code does not.
+addresses of buffers that live as long as the plan they belong to. Codes returned are those of fmiStatus, the
+same in all versions; `remark` says what a code does not. What differs is in `fmu_versions`.
 """
 
 from __future__ import annotations
@@ -12,17 +12,16 @@ import itertools
 import os
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from ctypes import byref, c_bool, c_double, c_int, c_size_t, c_uint32, c_void_p
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from ctypes import byref, c_bool, c_int, c_size_t, c_uint32, c_void_p
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import fmpy
 import numpy as np
-from fmpy import fmi2, fmi3
 
-from exlinn_fmi.components.fmu_description import FmuDescription
+from exlinn_fmi.components.fmu_description import FmuDescription, Kind
 from exlinn_fmi.components.native import NativeStep
 from exlinn_fmi.errors import FmuError
 
@@ -39,7 +38,7 @@ DTYPES: dict[str, Any] = {
         for bits in (8, 16, 32, 64)
     },
 }
-"""Element type of value buffers, by accessor; Boolean is c_int in FMI 2 and C99 bool in FMI 3."""
+"""Element type of value buffers, by accessor; Boolean is char in FMI 1, int in FMI 2 and bool in FMI 3."""
 
 # ── log messages ─────────────────────────────────────────────────────────────────────────────────────────
 
@@ -47,7 +46,7 @@ _logs: dict[int, deque[str]] = {}
 _handles = itertools.count(1)
 
 
-def _keep(handle: int | None, status: int, category: bytes | None, message: bytes | None) -> None:
+def keep_message(handle: int | None, status: int, category: bytes | None, message: bytes | None) -> None:
     """Keep what an FMU says of trouble; its chatter is dropped."""
     log = _logs.get(handle or 0)
     if log is not None and (status != 0 or b"error" in (category or b"").lower()):
@@ -56,14 +55,36 @@ def _keep(handle: int | None, status: int, category: bytes | None, message: byte
             log.append(text)
 
 
-@fmi2.fmi2CallbackLoggerTYPE  # type: ignore[untyped-decorator]
-def _log2(handle: int | None, _: bytes, status: int, category: bytes | None, message: bytes | None) -> None:
-    _keep(handle, status, category, message)
+class Refused(Exception):  # noqa: N818 - a status, on its way to becoming a message
+    """A function of the FMU returned fmi…Discard or worse where nothing can go on.
+
+    Args:
+        function: its name less the prefix.
+        code: what it returned.
+    """
+
+    def __init__(self, function: str, code: int) -> None:
+        super().__init__(function, code)
+        self.function, self.code = function, code
 
 
-@fmi3.fmi3LogMessageCallback  # type: ignore[untyped-decorator]
-def _log3(handle: int | None, status: int, category: bytes | None, message: bytes | None) -> None:
-    _keep(handle, status, category, message)
+@dataclass(frozen=True)
+class Update:
+    """What an iteration of Event Mode brought.
+
+    Args:
+        again: whether there must be another.
+        terminate: whether the FMU asks to end the simulation.
+        nominals_changed: whether nominal values of states are others now.
+        states_changed: whether states have jumped.
+        next_event: [s] time of the next time event, infinite where there is none.
+    """
+
+    again: bool
+    terminate: bool
+    nominals_changed: bool
+    states_changed: bool
+    next_event: float
 
 
 # ── instances ────────────────────────────────────────────────────────────────────────────────────────────
@@ -82,7 +103,8 @@ class Instance(ABC):
     """
 
     prefix: str
-    loader: Any
+    loaders: Mapping[Kind, Any]
+    terminate, release, reset = "Terminate", "FreeInstance", "Reset"
 
     def __init__(self, description: FmuDescription, folder: Path, name: str) -> None:
         self.description, self.name, self.folder = description, name, folder
@@ -107,7 +129,7 @@ class Instance(ABC):
         description = self.description
         try:
             with _working_folder_kept():
-                return self.loader(
+                return self.loaders[description.interface.kind](
                     guid=description.token,
                     modelIdentifier=description.identifier,
                     unzipDirectory=str(self.folder),
@@ -151,7 +173,7 @@ class Instance(ABC):
 
     def restart(self) -> None:
         """Back to the state after instantiation, by a fresh instance where the FMU allows more than one."""
-        if self.description.once and self.usable and self.call("Reset") < DISCARD:
+        if self.description.interface.once and self.usable and self.call(self.reset) < DISCARD:
             self.stepping, self.roll_back = False, False
         else:
             self.instantiate()
@@ -160,8 +182,8 @@ class Instance(ABC):
         """Terminate and free the instance, as far as its state allows."""
         if self.pointer and self.usable:
             if self.stepping:
-                self.call("Terminate")
-            self.function("FreeInstance", c_void_p, result=None)(self.pointer)
+                self.call(self.terminate)
+            self.function(self.release, c_void_p, result=None)(self.pointer)
         self.pointer, self.stepping = None, False
 
     def close(self) -> None:
@@ -180,8 +202,8 @@ class Instance(ABC):
         return before + text if text else ""
 
     def _tool_hint(self) -> str:
-        tool = self.description.tool
-        return f"; it says that it needs {tool} on this machine" if tool else ""
+        needs, tool = self.description.interface.needs_tool, self.description.tool
+        return f"; it says that it needs {tool} on this machine" if needs else ""
 
     # ── calls ────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -202,12 +224,23 @@ class Instance(ABC):
             self.usable = code != FATAL
         return code
 
+    def demand(self, name: str, *arguments: Any) -> None:
+        """Call a function with the instance and these C values.
+
+        Raises:
+            Refused: it returned fmi…Discard or worse.
+        """
+        kinds = [type(argument) for argument in arguments]
+        code = self.code(self.function(name, c_void_p, *kinds)(self.pointer, *arguments))
+        if code >= DISCARD:
+            raise Refused(name, code)
+
     @abstractmethod
     def _instantiate(self) -> int | None: ...
 
     @abstractmethod
-    def set_up(self, start_time: float, stop_time: float) -> int:
-        """Say what time will be simulated, before start values are set."""
+    def set_up(self, start_time: float, stop_time: float, tolerance: float | None) -> int:
+        """Say what time will be simulated and how precisely, before start values are set."""
 
     @abstractmethod
     def enter_initialization(self) -> int:
@@ -215,16 +248,25 @@ class Instance(ABC):
 
     def exit_initialization(self) -> int:
         """Leave Initialization Mode; steps may follow."""
-        code = self.call("ExitInitializationMode")
+        code = self._leave_initialization()
         self.stepping = code < ERROR
-        self._bind_step()
+        if self.description.interface.kind == "co_simulation":
+            self._bind_step()
         return code
 
-    @abstractmethod
     def accessor(
         self, verb: str, name: str, references: Any, values: Any
     ) -> tuple[Callable[..., int], tuple[Any, ...]]:
         """A get or set function and its arguments for these buffers, which the caller keeps."""
+        counted = self.description.version == 3
+        function = self.function(
+            f"{verb}{name}", c_void_p, c_void_p, c_size_t, c_void_p, *[c_size_t] * counted
+        )
+        arguments = self.pointer, references.ctypes.data, len(references), values.ctypes.data
+        return function, (*arguments, *[len(values)] * counted)
+
+    def _leave_initialization(self) -> int:
+        return self.call("ExitInitializationMode")
 
     @abstractmethod
     def _bind_step(self) -> None: ...
@@ -241,9 +283,31 @@ class Instance(ABC):
         """The C function behind `do_step`."""
         return NativeStep(address(self._do_step), self.pointer or 0, not self.roll_back, self._outcome)
 
+    # ── events, in Model Exchange and in FMI 3 Co-Simulation with Event Mode ──────────────────────────────
+
+    @abstractmethod
+    def update_discrete_states(self) -> Update:
+        """One iteration of Event Mode.
+
+        Raises:
+            Refused: the FMU reports an error.
+        """
+
+    def state_counts(self) -> tuple[int, int]:
+        """Numbers of continuous states and of event indicators."""
+        return self.description.state_count, self.description.indicator_count
+
+    model_functions: tuple[str, ...] = ()
+    """Names of the functions that a solver calls, in the order of `fmu_solver.FUNCTIONS`."""
+
+    def model_calls(self) -> list[int]:
+        """`fmu_solver.Model.calls`: the instance, addresses of the functions that a solver calls, flags."""
+        addresses = [address(self.function(name)) for name in self.model_functions]
+        return [self.pointer or 0, *addresses, self.description.version, self.roll_back]
+
     # ── state ────────────────────────────────────────────────────────────────────────────────────────────
 
-    state_noun: str
+    state_noun = ""
 
     def get_state(self) -> int:
         """A saved state, to be freed by `free_state`; from now on steps know that they may be undone.
@@ -274,147 +338,65 @@ class Instance(ABC):
             held = c_void_p(state)
             self.function(f"Free{self.state_noun}", c_void_p, c_void_p)(self.pointer, byref(held))
 
+    def serialize(self, state: int) -> bytes:
+        """A saved state as bytes.
 
-class Instance2(Instance):
-    """FMI 2.0."""
+        Raises:
+            Refused: the FMU reports an error.
+        """
+        size = c_size_t()
+        self.demand(f"Serialized{self.state_noun}Size", c_void_p(state), pointer_to(size))
+        data = ctypes.create_string_buffer(size.value)
+        self.demand(f"Serialize{self.state_noun}", c_void_p(state), pointer_to(data), size)
+        return data.raw
 
-    prefix = "fmi2"
-    loader = fmi2.FMU2Slave
-    state_noun = "FMUstate"
+    deserializer = ""
 
-    def _instantiate(self) -> int | None:
-        calls = fmi2.fmi2CallbackFunctions()
-        calls.logger = _log2
-        # The C library's own functions, not wrapped in Python: an FMU may allocate in every step.
-        calls.allocateMemory = ctypes.cast(fmpy.calloc, fmi2.fmi2CallbackAllocateMemoryTYPE)
-        calls.freeMemory = ctypes.cast(fmpy.free, fmi2.fmi2CallbackFreeMemoryTYPE)
-        calls.componentEnvironment = self._handle
-        with suppress(ImportError, OSError):  # it formats messages; FMPy has none for some platforms
-            from fmpy.logging import addLoggerProxy
+    def deserialize(self, data: bytes) -> int:
+        """A saved state of bytes, to be freed by `free_state`.
 
-            addLoggerProxy(byref(calls))
-        self._callbacks = calls
-        resources = (self.folder / "resources").as_uri()
-        pointer: int | None = self._fmu.fmi2Instantiate(
-            self.name.encode(),
-            fmi2.fmi2CoSimulation,
-            self.description.token.encode(),
-            resources.encode(),
-            byref(calls),
-            False,
-            True,
-        )
-        return pointer
+        Raises:
+            Refused: the FMU reports an error.
+        """
+        state = c_void_p()
+        kept = ctypes.create_string_buffer(data, len(data))
+        self.demand(self.deserializer, pointer_to(kept), c_size_t(len(data)), pointer_to(state))
+        return state.value or 0
 
-    def set_up(self, start_time: float, stop_time: float) -> int:
-        """fmi2SetupExperiment."""
-        function = self.function("SetupExperiment", c_void_p, c_int, c_double, c_double, c_int, c_double)
-        return self.code(function(self.pointer, 0, 0.0, start_time, 1, stop_time))
+    # ── derivatives ──────────────────────────────────────────────────────────────────────────────────────
 
-    def enter_initialization(self) -> int:
-        """fmi2EnterInitializationMode."""
-        return self.call("EnterInitializationMode")
+    def directional_derivative(self, unknowns: Any, knowns: Any, seed: Any, result: Any) -> None:
+        """∂(unknowns)/∂(knowns) · seed into `result`; all are buffers, the first two of value references.
 
-    def accessor(
-        self, verb: str, name: str, references: Any, values: Any
-    ) -> tuple[Callable[..., int], tuple[Any, ...]]:
-        """fmi2Get… or fmi2Set…."""
-        function = self.function(f"{verb}{name}", c_void_p, c_void_p, c_size_t, c_void_p)
-        return function, (self.pointer, references.ctypes.data, len(references), values.ctypes.data)
+        Raises:
+            Refused: the FMU reports an error.
+        """
+        v, z = c_void_p, c_size_t
+        n, k = len(unknowns), len(knowns)
+        sizes = (z(k), z(n)) if self.description.version == 3 else ()
+        first = (v(unknowns.ctypes.data), z(n), v(knowns.ctypes.data), z(k), v(seed.ctypes.data))
+        last = v(result.ctypes.data)
+        if sizes:
+            self.demand("GetDirectionalDerivative", *first, sizes[0], last, sizes[1])
+        else:
+            self.demand("GetDirectionalDerivative", *first, last)
 
-    def _bind_step(self) -> None:
-        self._do_step = self.function("DoStep", c_void_p, c_double, c_double, c_int)
+    def set_input_derivatives(self, references: Any, order: int, values: Any) -> None:
+        """Derivatives of inputs for the next step (FMI 1 and 2 Co-Simulation).
 
-    def do_step(self, t: float, h: float) -> int:
-        """fmi2DoStep."""
-        return self.outcome(self._do_step(self.pointer, t, h, not self.roll_back))
-
-    def outcome(self, code: int) -> int:
-        """What fmi2DoStep returned, with a remark where it says more."""
-        if code == DISCARD:
-            ended = c_int()
-            self.function("GetBooleanStatus", c_void_p, c_int, c_void_p)(
-                self.pointer, fmi2.fmi2Terminated, byref(ended)
-            )
-            self.remark = "the FMU asks to end the simulation" if ended.value else ""
-        return code
-
-
-class Instance3(Instance):
-    """FMI 3.0."""
-
-    prefix = "fmi3"
-    loader = fmi3.FMU3Slave
-    state_noun = "FMUState"
-
-    def _instantiate(self) -> int | None:
-        resources = f"{self.folder / 'resources'}{os.sep}"
-        pointer: int | None = self._fmu.fmi3InstantiateCoSimulation(
-            self.name.encode(),
-            self.description.token.encode(),
-            resources.encode(),
-            False,  # visible
-            True,  # loggingOn, or FMUs keep silent on errors too
-            False,  # eventModeUsed
-            False,  # earlyReturnAllowed
-            None,
-            0,
-            self._handle,
-            _log3,
-            fmi3.fmi3IntermediateUpdateCallback(),
-        )
-        return pointer
-
-    def set_up(self, start_time: float, stop_time: float) -> int:
-        """FMI 3 says it on entering Initialization Mode."""
-        self._span = start_time, stop_time
-        return 0
-
-    def enter_initialization(self) -> int:
-        """fmi3EnterInitializationMode."""
-        start_time, stop_time = self._span
-        function = self.function(
-            "EnterInitializationMode", c_void_p, c_bool, c_double, c_double, c_bool, c_double
-        )
-        return self.code(function(self.pointer, False, 0.0, start_time, True, stop_time))
-
-    def accessor(
-        self, verb: str, name: str, references: Any, values: Any
-    ) -> tuple[Callable[..., int], tuple[Any, ...]]:
-        """fmi3Get… or fmi3Set…."""
-        function = self.function(f"{verb}{name}", c_void_p, c_void_p, c_size_t, c_void_p, c_size_t)
+        Raises:
+            Refused: the FMU reports an error.
+        """
         count = len(references)
-        return function, (self.pointer, references.ctypes.data, count, values.ctypes.data, count)
-
-    def _bind_step(self) -> None:
-        flag = c_void_p
-        self._do_step = self.function(
-            "DoStep", c_void_p, c_double, c_double, c_bool, flag, flag, flag, c_void_p
-        )
-        self._event, self._end, self._early, self._reached = c_bool(), c_bool(), c_bool(), c_double()
-        outcome = (self._event, self._end, self._early, self._reached)
-        self._outcome = tuple(ctypes.addressof(value) for value in outcome)
-
-    def do_step(self, t: float, h: float) -> int:
-        """fmi3DoStep; ending or returning early is a discarded step to us."""
-        return self.outcome(self._do_step(self.pointer, t, h, not self.roll_back, *self._outcome))
-
-    def outcome(self, code: int) -> int:
-        """What fmi3DoStep returned, or that it discarded the step where it wants to end or returned early."""
-        if self._end.value or self._early.value:
-            wish = "asks to end the simulation" if self._end.value else "returned early, which it may not"
-            self.remark = f"the FMU {wish}, at t = {self._reached.value:.9g} s"
-            return max(code, DISCARD)
-        return code
+        orders = np.full(count, order, dtype=np.int32)
+        v = c_void_p
+        pointers = v(orders.ctypes.data), v(values.ctypes.data)
+        self.demand("SetRealInputDerivatives", v(references.ctypes.data), c_size_t(count), *pointers)
 
 
-def make_instance(description: FmuDescription, folder: Path, name: str) -> Instance:
-    """An instance of an unpacked FMU.
-
-    Raises:
-        FmuError: the binary cannot be loaded, or refuses to be instantiated.
-    """
-    return (Instance2 if description.version == 2 else Instance3)(description, folder, name)
+def pointer_to(value: Any) -> c_void_p:
+    """The address of a C value, which the caller keeps."""
+    return c_void_p(ctypes.addressof(value))
 
 
 def address(function: Any) -> int:
@@ -424,7 +406,7 @@ def address(function: Any) -> int:
 
 def value_buffer(description: FmuDescription, accessor: str, size: int) -> np.ndarray[Any, Any]:
     """An array for values of one accessor, laid out as the C functions want it."""
-    boolean = np.int32 if description.version == 2 else np.bool_
+    boolean = {1: np.int8, 2: np.int32, 3: np.bool_}[description.version]
     return np.zeros(size, dtype=DTYPES.get(accessor, boolean))
 
 

@@ -11,12 +11,13 @@ import json
 import math
 import weakref
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
 
 from exlinn_fmi import errors
 from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
-from exlinn_fmi.components.fmu import FmuComponent, read_variables
+from exlinn_fmi.components.fmu import FmuComponent, FmuSettings, read_variables
 from exlinn_fmi.components.process import PATIENCE, LostError, Process
 from exlinn_fmi.components.worker import (
     CALL,
@@ -278,7 +279,7 @@ class _SavedState:
 
 
 def isolated_fmu(
-    name: str, path: Path, timeout: float, memory: float | None, **settings: Any
+    name: str, path: Path, timeout: float, memory: float | None, settings: FmuSettings | None = None
 ) -> IsolatedComponent:
     """An FMU in a process of its own.
 
@@ -287,17 +288,17 @@ def isolated_fmu(
         path: the .fmu file.
         timeout: longest time that a call may take [s].
         memory: most memory that it may take [bytes]; what the machine has if None.
-        settings: those of `FmuComponent`.
+        settings: how it is to be used.
 
     Raises:
         FmuError: the file cannot be used.
         ComponentError: it crashed or hung while it was loaded.
     """
-    arguments = {"name": name, "path": str(path.absolute()), **settings}
-    variables = read_variables(path, runnable=True)
+    arguments = {"name": name, "path": str(path.absolute()), **asdict(settings or FmuSettings())}
+    variables = read_variables(path, runnable=True, settings=settings)
     return IsolatedComponent(name, variables, f"{__name__}:fmu", arguments, timeout, memory)
 
 
 def fmu(name: str, path: str, **settings: Any) -> FmuComponent:
     """An FMU; called in the process that is to run it."""
-    return FmuComponent(name, Path(path), **settings)
+    return FmuComponent(name, Path(path), FmuSettings(**settings))

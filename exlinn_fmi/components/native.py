@@ -29,8 +29,10 @@ class NativeAccess:
         references: value references, to be kept while it is called.
         dtype: element type of the values.
         boolean: whether the values are truth values, 0 and 1 only.
-        counted: whether ``count`` follows once more after ``values`` (FMI 3).
+        counted: whether the number of values follows after ``values`` (FMI 3).
         positions: which of the variables that were asked for it gets or sets, in this order.
+        array: the whole array that the one reference stands for, where these are elements of one.
+        elements: where in `array` they are.
     """
 
     name: str
@@ -41,6 +43,8 @@ class NativeAccess:
     boolean: bool
     counted: bool
     positions: Indices
+    array: NDArray[Any] | None = None
+    elements: Indices | None = None
 
 
 @dataclass(frozen=True)

@@ -264,7 +264,7 @@ def _run(
                         program[at, REFERENCES],
                         program[at, COUNT],
                         program[at, VALUES],
-                        program[at, COUNT],
+                        program[at, COUNTED],
                     )
                 else:
                     result = _access2(
@@ -282,7 +282,7 @@ def _run(
                         program[at, REFERENCES],
                         program[at, COUNT],
                         program[at, VALUES],
-                        program[at, COUNT],
+                        program[at, COUNTED],
                     )
                 else:
                     result = _access2(

@@ -168,7 +168,8 @@ class Program:
             for n, call in enumerate(calls, 1):
                 values, kind = self._buffer(call, x.given)
                 if kind is not None:
-                    cells = zip(_addresses(x.given, call.positions), _addresses(values), strict=True)
+                    to = _addresses(values, call.elements)
+                    cells = zip(_addresses(x.given, call.positions), to, strict=True)
                     self._add_moves((kind, a, b) for a, b in cells)
                 columns = {**who, **_arguments(call, values), k.FIRST: first, k.LAST: len(self._moves)}
                 act = Act("setting inputs", call.name, native, x, vector, more=len(calls) - n)
@@ -180,7 +181,8 @@ class Program:
                 values, kind = self._buffer(call, x.taken)
                 first = len(self._moves)
                 if kind is not None:
-                    cells = zip(_addresses(values), _addresses(x.taken, call.positions), strict=True)
+                    out = _addresses(values, call.elements)
+                    cells = zip(out, _addresses(x.taken, call.positions), strict=True)
                     self._add_moves((kind + k.FROM, a, b) for a, b in cells)
                 columns = {**who, **_arguments(call, values), k.FIRST: first, k.LAST: len(self._moves)}
                 if n == len(calls):
@@ -191,10 +193,10 @@ class Program:
     def _buffer(self, call: NativeAccess, piece: Values) -> tuple[NDArray[Any], int | None]:
         """Values of a call: the piece of the vector itself, or else a buffer and the kind of its elements."""
         self._kept.append(call.references)
-        whole = np.array_equal(call.positions, np.arange(len(piece)))
+        whole = call.array is None and np.array_equal(call.positions, np.arange(len(piece)))
         if whole and call.dtype == np.float64:
             return piece, None
-        buffer = np.zeros(len(call.positions), dtype=call.dtype)
+        buffer = np.zeros(len(call.positions), dtype=call.dtype) if call.array is None else call.array
         self._kept.append(buffer)
         if call.boolean:
             return buffer, k.B1 if buffer.itemsize == 1 else k.B4
@@ -208,7 +210,7 @@ def _arguments(call: NativeAccess, values: NDArray[Any]) -> Columns:
         k.REFERENCES: call.references.ctypes.data,
         k.COUNT: len(call.references),
         k.VALUES: _address(values),
-        k.COUNTED: call.counted,
+        k.COUNTED: len(values) if call.counted else 0,
     }
 
 

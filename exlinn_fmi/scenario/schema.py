@@ -42,7 +42,7 @@ class ComponentBase(Spec):
 
 
 class FmuComponent(ComponentBase):
-    """A Functional Mock-up Unit, FMI 2.0 or 3.0 Co-Simulation."""
+    """A Functional Mock-up Unit: FMI 1.0, 2.0 or 3.0 Co-Simulation, 2.0 or 3.0 Model Exchange."""
 
     fmu: str = Field(description="the .fmu file, relative to the scenario")
     isolate: bool | None = Field(
@@ -53,6 +53,17 @@ class FmuComponent(ComponentBase):
     timeout: Positive = Field(60.0, description="longest time that a call may take [s], if it is isolated")
     memory: Positive | None = Field(
         None, description="most memory that it may take [MB], if it is isolated; all there is if not given"
+    )
+    interface: Literal["co_simulation", "model_exchange"] | None = Field(
+        None, description="how it is used; Co-Simulation where the FMU has it, if not given"
+    )
+    solver: Literal["auto", "dopri5", "dop853", "lsoda", "bdf", "radau"] = Field(
+        "auto",
+        description="for Model Exchange: dopri5 and dop853 for models that are not stiff, bdf and radau for "
+        "stiff ones, lsoda for either; auto begins with dopri5 and takes radau if the model proves stiff",
+    )
+    tolerance: Positive | None = Field(
+        None, description="relative tolerance of integration; what the FMU states, else 1e-6, if not given"
     )
 
 

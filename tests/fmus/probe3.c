@@ -112,9 +112,12 @@ EXPORT fmi3Status fmi3Reset(fmi3Instance c) {
 EXPORT fmi3Status fmi3GetFloat64(fmi3Instance c, const fmi3ValueReference vr[], size_t n, fmi3Float64 values[],
                                  size_t size) {
     Probe* p = c;
-    if (p->phase == INSTANTIATED || size != n) return fail(p, "GetFloat64");
+    size_t have = 0;
+    for (size_t k = 0; k < n; k++) have += vr[k] == VECTOR ? 3 : 1;
+    if (p->phase == INSTANTIATED || size != have) return fail(p, "GetFloat64");
     outputs(&p->s);
-    for (size_t k = 0; k < n; k++) values[k] = p->s.real[vr[k]];
+    for (size_t k = 0; k < n; k++)
+        for (int i = 0; i < (vr[k] == VECTOR ? 3 : 1); i++) *values++ = p->s.real[vr[k] + i];
     return fmi3OK;
 }
 

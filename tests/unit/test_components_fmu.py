@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from exlinn_fmi.components import cache
 from exlinn_fmi.components.base import Status
 from exlinn_fmi.components.fmu import FmuComponent, read_variables
+from exlinn_fmi.components.texts import text
 from exlinn_fmi.errors import ComponentError, FmuError, InputError
 
 
@@ -155,10 +156,11 @@ def test_variables_carry_what_the_model_description_says(tmp_path: Path) -> None
     assert (found["doubled"].causality, found["doubled"].start) == ("local", None)
 
 
-def test_strings_and_arrays_are_left_out(tmp_path: Path) -> None:
-    names = {v.name for v in read_variables(probe(tmp_path, version=3))}
-    assert names.isdisjoint({"label", "vector"})
-    assert {"time", "size", "y", "mode_out"} <= names
+def test_arrays_are_taken_apart_and_texts_are_variables(tmp_path: Path) -> None:
+    found = {v.name: v for v in read_variables(probe(tmp_path, version=3))}
+    assert {"time", "size", "y", "mode_out", "vector[1]", "vector[2]", "vector[3]"} <= set(found)
+    assert found["label"].type == "String"
+    assert text(found["label"].start) == "a"
 
 
 def test_an_fmi3_alias_is_the_same_variable(probe3: Driver) -> None:
@@ -167,8 +169,8 @@ def test_an_fmi3_alias_is_the_same_variable(probe3: Driver) -> None:
     assert probe3.get("u", "y") == [2.0, 4.0]
 
 
-def test_fmi3_structural_parameters_cannot_be_set(probe3: Driver) -> None:
-    with pytest.raises(InputError, match=r"probe\.size: is a constant"):
+def test_a_structural_parameter_is_not_changed_once_the_fmu_is_open(probe3: Driver) -> None:
+    with pytest.raises(InputError, match=r"probe\.size: sizes arrays and is 3 since the FMU was opened"):
         probe3.begin(size=4)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import fmpy
 import pytest
-from fmu_helpers import VARIABLES_2, description_2, library, pack, probe
+from fmu_helpers import VARIABLES_2, description_2, description_3, library, pack, probe
 
 from exlinn_fmi.components import archive
 from exlinn_fmi.components.fmu import FmuComponent, read_variables
@@ -104,9 +104,11 @@ def test_a_zipped_folder_is_told(tmp_path: Path) -> None:
         ("<fmiModelDescription fmiVersion='2.0'", "no well-formed XML: .*line 1"),
         ("<?xml version='1.0' encoding='UTF-9'?><a/>", "no well-formed XML: .*UTF-9"),
         ("<html/>", "begins with <html>, expected <fmiModelDescription>"),
-        (description_2(version="1.0"), r"FMI version 1\.0; expected 2\.0 or 3\.0"),
-        (description_2(use="ModelExchange"), "no Co-Simulation: it is for ModelExchange only"),
-        ('<fmiModelDescription fmiVersion="2.0"/>', "no Co-Simulation: it names no kind of use"),
+        (description_2(version="4.0"), r"FMI version 4\.0; expected 1\.0, 2\.0 or 3\.0"),
+        (
+            description_3().replace("CoSimulation", "ScheduledExecution"),
+            r"no Co-Simulation and no Model Exchange of FMI 2\.0 or 3\.0: it is for Scheduled Execution only",
+        ),
         (description_2(identifier="../../Probe"), "the model identifier '../../Probe' is no C identifier"),
         (description_2(identifier=""), "the model identifier '' is no C identifier"),
         (description_2(variables=VARIABLES_2 * 2), "two variables are called 'u'"),

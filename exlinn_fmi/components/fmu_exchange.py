@@ -1,0 +1,239 @@
+"""Model Exchange: the FMU gives derivatives and event indicators, the integration is ours.
+
+Between events a solver carries the states: Dormand and Prince's method, compiled (`fmu_solver`), or one of
+SciPy's (`fmu_stiff`). At an event (an indicator changes its sign, a time that the FMU announced is reached,
+or it asks for one after a step) the FMU goes through Event Mode, and integration starts afresh from there.
+
+References: FMI 2.0 §3.2, FMI 3.0 §3.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from ctypes import c_size_t, c_void_p
+from typing import Any
+
+import numpy as np
+
+from exlinn_fmi.components import fmu_solver as compiled
+from exlinn_fmi.components.base import Values
+from exlinn_fmi.components.fmu_events import EventMode, Stopped, close
+from exlinn_fmi.components.fmu_native import ERROR, Instance, Refused
+from exlinn_fmi.components.fmu_steppers import Stepper
+
+SOLVERS = ("auto", "dopri5", "dop853", "lsoda", "bdf", "radau")
+TOLERANCE = 1e-6
+"""Relative tolerance where neither the scenario nor the FMU states one."""
+
+MOST_EVENTS = 1000
+"""Events in one instant before the model is taken to chatter."""
+
+
+class Solver(ABC):
+    """Integrates a model between events.
+
+    Args:
+        model: the FMU; its time and states are moved on.
+    """
+
+    def __init__(self, model: compiled.Model) -> None:
+        self.model = model
+
+    @abstractmethod
+    def integrate(self, end: float) -> int:
+        """Integrate to `end` [s] or the first event before; one of the codes of `fmu_solver`."""
+
+
+class DormandPrince(Solver):
+    """The compiled method, of order 5 with adaptive steps, for models that are not stiff."""
+
+    def integrate(self, end: float) -> int:
+        """See `Solver`."""
+        code, _ = compiled.integrate(*self.model.arrays, end, NO_GRID, NO_TABLE, 0)
+        return int(code)
+
+
+NO_GRID, NO_TABLE = np.zeros(0), np.zeros((0, 0))
+
+
+class ModelExchange(Stepper):
+    """Carries a Model Exchange FMU over communication steps.
+
+    Args:
+        instance: the FMU, in Initialization Mode or before.
+        solver: one of `SOLVERS`; ``auto`` begins with ``dopri5`` and goes on with ``radau`` where the model
+            proves stiff.
+        tolerance: relative tolerance; absolute ones are this times the states' nominal values.
+
+    Attributes:
+        remark: what the user should know of the integration, "" where there is nothing.
+    """
+
+    has_events = True
+
+    def __init__(self, instance: Instance, solver: str, tolerance: float) -> None:
+        self._instance, self._choice, self._tolerance = instance, solver, tolerance
+        self._events = EventMode(instance, "EnterContinuousTimeMode")
+        self._stale = False
+        self.remark = ""
+
+    # ── stepping ─────────────────────────────────────────────────────────────────────────────────────────
+
+    def begin(self, t: float) -> None:
+        """The first event, and all that integration needs."""
+        self._events.begin(t)
+        n, m = self._instance.state_counts()
+        calls = np.array(self._instance.model_calls(), dtype=np.int64)
+        if not self._instance.description.interface.completed_step:
+            calls[compiled.COMPLETED] = 0
+        self.model = compiled.Model.make(calls, n, m, self._tolerance)
+        self.model.clock[compiled.T] = t
+        self._solver = self._make(self._choice)
+        self._load(nominals=True)
+
+    def _make(self, name: str) -> Solver:
+        if name in ("auto", "dopri5"):
+            return DormandPrince(self.model)
+        from exlinn_fmi.components.fmu_stiff import ScipySolver
+
+        return ScipySolver(self.model, name, self._instance)
+
+    def step(self, t: float, h: float) -> int:
+        """Integrate from event to event; inputs are held, or follow the derivatives given."""
+        self.settle()
+        end, here, events = t + h, t, 0
+        self.model.clock[compiled.T] = t
+        self.model.calls[compiled.KEEP] = self._instance.roll_back
+        while True:
+            target = min(end, self._events.next_event)
+            target = end if close(target, end) else target
+            code = self._solver.integrate(target) if target > self.model.t else compiled.REACHED
+            if code == compiled.STIFF:
+                self._meet_stiffness()
+                continue
+            self._check(code)
+            due = self._events.next_event <= self.model.t or close(self._events.next_event, self.model.t)
+            if code == compiled.REACHED and not due:
+                break
+            events = events + 1 if close(here, self.model.t) else 0
+            here = self.model.t
+            if events > MOST_EVENTS:
+                raise Stopped(
+                    f"more than {MOST_EVENTS} events at t = {here:.9g} s: the model chatters", ERROR
+                )
+            self._event()
+            if self.model.t >= end:
+                break
+        self._drop_derivatives()
+        return 0
+
+    def _meet_stiffness(self) -> None:
+        """Go on with another solver, or not mind."""
+        self.model.clock[compiled.STIFFNESS] = -np.inf
+        if self._choice == "auto":
+            self.remark = (
+                f"stiff from t = {self.model.t:.9g} s on: solved by radau; say `solver: radau` or `bdf`"
+            )
+            self._solver = self._make("radau")
+
+    def _event(self) -> None:
+        """Go through Event Mode at the time reached."""
+        changes = self._events.handle(self.model.t)
+        self._load(changes.nominals)
+
+    def _load(self, nominals: bool) -> None:
+        """States, nominal values and indicators as Event Mode left them; the solver begins afresh."""
+        m = self.model
+        if m.x.size:
+            self._instance.demand("GetContinuousStates", *_span(m.x))
+            if nominals:
+                scale = np.ones_like(m.x)
+                self._instance.demand("GetNominalsOfContinuousStates", *_span(scale))
+                m.w[compiled.ATOL] = self._tolerance * np.where(scale > 0, scale, 1.0)
+        if m.z.size:
+            self._instance.demand("GetEventIndicators", *_span(m.z[compiled.HERE]))
+        m.clock[compiled.H] = 0.0
+
+    # ── inputs and outputs ───────────────────────────────────────────────────────────────────────────────
+
+    def enter_event_mode(self) -> None:
+        """fmi…EnterEventMode."""
+        self._events.enter()
+
+    def inputs_changed(self) -> None:
+        """Continuous inputs may have switched something."""
+        self._stale = True
+
+    def settle(self) -> None:
+        """Handle the event that new values of discrete variables are, or that new inputs have caused."""
+        if self._events.inside:
+            self._event()
+        elif self._stale and self.model.z.size:
+            z = self.model.z
+            self._instance.demand("GetEventIndicators", *_span(z[compiled.THERE]))
+            if compiled.switched(z, compiled.THERE):
+                self._event()
+            else:
+                z[compiled.HERE] = z[compiled.THERE]
+        self._stale = False
+
+    def set_derivatives(self, references: Any, values: Values, rates: Values) -> None:
+        """Let inputs change over the next step.
+
+        Args:
+            references: (k,) value references.
+            values: [input units] (k,) values at the present time.
+            rates: [input units / s] (k,) their derivatives.
+        """
+        self.model.vary(references, values, rates)
+
+    def _drop_derivatives(self) -> None:
+        if self.model.u.size:
+            self.model.vary(np.zeros(0, dtype=np.uint32), np.zeros(0), np.zeros(0))
+
+    # ── state ────────────────────────────────────────────────────────────────────────────────────────────
+
+    def snapshot(self) -> Any:
+        """Time, solver and events; the states are in the FMU."""
+        m = self.model
+        return m.clock.copy(), m.w.copy(), m.z.copy(), self._events.snapshot()
+
+    def restore(self, saved: Any) -> None:
+        """Back to a snapshot."""
+        m = self.model
+        m.clock[:], m.w[:], m.z[:] = saved[:3]
+        self._events.restore(saved[3])
+
+    # ── failure ──────────────────────────────────────────────────────────────────────────────────────────
+
+    def _check(self, code: int) -> None:
+        """Stop on what is no reason to go on.
+
+        Raises:
+            Refused: the FMU reports an error.
+            Stopped: it asks to end, or it cannot be integrated.
+        """
+        at = f"at t = {self.model.t:.9g} s"
+        if code >= compiled.FAILED:
+            place, status = divmod(code, compiled.FAILED)
+            name = self._instance.model_functions[place - 1]
+            raise Refused(name, self._instance.code(status))
+        if code == compiled.TERMINATE:
+            raise Stopped(f"the FMU asks to end the simulation, {at}", 2)
+        if code == compiled.TOO_MANY_STEPS:
+            raise Stopped(
+                f"the solver takes more than {compiled.MOST_STEPS:.0f} steps {at}: if the model is stiff, "
+                "give the component `solver: radau`; else a larger `tolerance`",
+                ERROR,
+            )
+        if code == compiled.NO_PROGRESS:
+            raise Stopped(
+                f"the solver makes no progress {at}: derivatives are not finite, or jump where no event is "
+                "indicated",
+                ERROR,
+            )
+
+
+def _span(array: Any) -> tuple[Any, Any]:
+    """Pointer and length of an array, for a C function."""
+    return c_void_p(array.ctypes.data), c_size_t(len(array))

@@ -1,0 +1,201 @@
+"""Values of FMU variables in and out: one C call per type, with buffers that are ready.
+
+Numbers are converted to and from float64. An element of an array travels with its whole array, which is kept
+from call to call: FMI 3 sets and gets arrays as a whole. Texts and binaries are told by number (`texts`).
+"""
+
+from __future__ import annotations
+
+import ctypes
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from exlinn_fmi.components.base import Indices, Values
+from exlinn_fmi.components.fmu_description import FmuDescription
+from exlinn_fmi.components.fmu_native import Instance, reference_buffer, value_buffer
+from exlinn_fmi.components.texts import handle, text
+
+EXACT = 2.0**53
+"""Whole numbers beyond it are not all held by float64."""
+
+TEXTS = ("String", "Binary")
+"""Accessors of what is told by number."""
+
+Arrays = dict[tuple[str, int], "np.ndarray[Any, Any]"]
+"""Arrays by accessor and value reference, as last set."""
+
+
+class Group(ABC):
+    """One C call: its function, its arguments and the buffers that they point to.
+
+    Attributes:
+        accessor: name of the function less the prefix and the verb.
+        positions: which of the values asked for it holds.
+        function: the C function.
+        arguments: what it is called with.
+    """
+
+    accessor: str
+    positions: Any
+    function: Callable[..., int]
+    arguments: tuple[Any, ...]
+
+    @abstractmethod
+    def fill(self, values: Values) -> int | None:
+        """Put values into the buffer; gives the position of the first that its type cannot hold."""
+
+    @abstractmethod
+    def take(self, values: Values) -> int | None:
+        """Put the buffer into the values; gives the position of the first that is too large to be exact."""
+
+
+class Numbers(Group):
+    """Numbers of one type: scalars, or elements of one array."""
+
+    def __init__(
+        self, instance: Instance, verb: str, accessor: str, references: list[int], positions: Any, array: Any
+    ) -> None:
+        self.accessor, self.positions = accessor, positions
+        self._references = reference_buffer(references)
+        elements, whole = array if array is not None else (slice(None), None)
+        self.buffer = (
+            value_buffer(instance.description, accessor, len(references)) if whole is None else whole
+        )
+        self._elements = elements
+        self.function, self.arguments = instance.accessor(verb, accessor, self._references, self.buffer)
+        self._double = self.buffer.dtype == np.float64
+        self._boolean = accessor == "Boolean"
+        self._wide = accessor in ("Int64", "UInt64")
+
+    def fill(self, values: Values) -> int | None:
+        """See `Group`."""
+        given = values[self.positions]
+        if self._double:
+            self.buffer[self._elements] = given
+            return None
+        with np.errstate(invalid="ignore", over="ignore"):
+            self.buffer[self._elements] = given.astype(bool) if self._boolean else given
+        if self.buffer.dtype == np.float32:
+            return None
+        refused = np.flatnonzero(self.buffer[self._elements] != given)
+        return self._place(values, refused[0]) if refused.size else None
+
+    def take(self, values: Values) -> int | None:
+        """See `Group`."""
+        got = self.buffer[self._elements]
+        values[self.positions] = got
+        if self._wide and (large := np.flatnonzero((got > EXACT) | (got < -EXACT))).size:
+            return self._place(values, large[0])
+        return None
+
+    def _place(self, values: Values, k: int) -> int:
+        return int(np.arange(len(values))[self.positions][k])
+
+
+class Texts(Group):
+    """Texts or binaries, scalars and arrays alike."""
+
+    def __init__(
+        self, instance: Instance, verb: str, accessor: str, references: list[int], positions: Any, array: Any
+    ) -> None:
+        self.accessor, self.positions = accessor, positions
+        self._references = reference_buffer(references)
+        self._elements = np.arange(len(references)) if array is None else array[0]
+        count = len(references) if array is None else len(array[1])
+        self._whole = np.zeros(count) if array is None else array[1]
+        self._pointers, self._sizes = np.zeros(count, np.uintp), np.zeros(count, np.uintp)
+        self._kept: list[Any] = []
+        self._binary = accessor == "Binary"
+        self.function, self.arguments = instance.accessor(verb, accessor, self._references, self._pointers)
+        if self._binary:
+            kinds, arguments = [*self.function.argtypes], [*self.arguments]  # type: ignore[attr-defined]
+            kinds.insert(3, ctypes.c_void_p)
+            arguments.insert(3, self._sizes.ctypes.data)
+            self.function.argtypes, self.arguments = kinds, tuple(arguments)  # type: ignore[attr-defined]
+
+    def fill(self, values: Values) -> int | None:
+        """See `Group`."""
+        self._whole[self._elements] = values[self.positions]
+        try:
+            given = [text(number) for number in self._whole]
+        except ValueError:
+            return 0
+        data = [value if isinstance(value, bytes) else value.encode() for value in given]
+        self._kept = [ctypes.create_string_buffer(value, len(value) + 1) for value in data]
+        self._pointers[:] = [ctypes.addressof(kept) for kept in self._kept]
+        self._sizes[:] = [len(value) for value in data]
+        return None
+
+    def take(self, values: Values) -> int | None:
+        """See `Group`."""
+        for k, place in enumerate(self._elements):
+            pointer, size = int(self._pointers[place]), int(self._sizes[place])
+            if self._binary:
+                value: str | bytes = ctypes.string_at(pointer, size) if pointer and size else b""
+            else:
+                value = ctypes.string_at(pointer).decode("utf-8", "replace") if pointer else ""
+            self._whole[place] = handle(value)
+            values[self._where(values, k)] = self._whole[place]
+        return None
+
+    def _where(self, values: Values, k: int) -> int:
+        return int(np.arange(len(values))[self.positions][k])
+
+
+def by_call(description: FmuDescription, indices: Indices) -> dict[tuple[str, int | None], list[int]]:
+    """Positions in `indices` by C call: scalars by accessor, each array by itself."""
+    positions: dict[tuple[str, int | None], list[int]] = {}
+    for position, k in enumerate(indices):
+        alone = description.references[k] if is_array(description, k) else None
+        positions.setdefault((description.accessors[k], alone), []).append(position)
+    return positions
+
+
+def is_array(description: FmuDescription, k: int) -> bool:
+    """Whether a variable is an element of an array of more than one; an array of one is set like a scalar."""
+    return description.sizes[k] > 1
+
+
+def groups(
+    description: FmuDescription,
+    instance: Instance,
+    arrays: Arrays,
+    verb: str,
+    indices: Indices,
+    chosen: Indices,
+) -> list[Group]:
+    """The C calls that get or set those of the variables at `indices` whose positions are `chosen`."""
+    made: list[Group] = []
+    for (accessor, reference), places in by_call(description, indices[chosen]).items():
+        where = chosen[places]
+        positions: Any = slice(None) if len(where) == len(indices) else where
+        kind = Texts if accessor in TEXTS else Numbers
+        if reference is None:
+            references = [description.references[k] for k in indices[where]]
+            made.append(kind(instance, verb, accessor, references, positions, None))
+        else:
+            elements = np.array([description.elements[k] for k in indices[where]], dtype=np.intp)
+            whole = arrays[accessor, reference]
+            if verb == "Get":
+                whole = whole.copy()
+            made.append(kind(instance, verb, accessor, [reference], positions, (elements, whole)))
+    return made
+
+
+def start_arrays(description: FmuDescription) -> Arrays:
+    """All arrays with their start values, zero where there is none."""
+    arrays: Arrays = {}
+    for k, variable in enumerate(description.variables):
+        key = description.accessors[k], description.references[k]
+        if not is_array(description, k):
+            continue
+        if key not in arrays:
+            texts = key[0] in TEXTS
+            size = description.sizes[k]
+            arrays[key] = np.zeros(size) if texts else value_buffer(description, key[0], size)
+        if variable.start is not None:
+            arrays[key][description.elements[k]] = variable.start
+    return arrays
