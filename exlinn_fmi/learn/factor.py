@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 CUT = 1e-10
 """Singular values of the functions below this share of the largest are gauges."""
+PRECISE = 1e-12
+"""The same for bases that are to hold the last digits."""
 SAMPLES = 400
 """About so many samples are looked at, …"""
 STEPS = 60
@@ -55,6 +57,37 @@ def fit_factor(
         if step.value < np.finfo(float).eps ** 2:
             break
     return best.reshape(factor.shape)
+
+
+def fit_cholesky(
+    mass: Float[Array, "B m m"],
+    change: Float[Array, "B m m nz"],
+    basis: Float[Array, "B k"],
+    slopes: Float[Array, "B k nz"],
+) -> Float[Array, "m m k"]:
+    """Coefficients of each entry of M's Cholesky factor on a basis rich enough to hold it, with derivatives.
+
+    Forces hold derivatives of M: a fit to M alone, however close, could waver between the samples.
+
+    Args:
+        mass: M at the samples, positive definite.
+        change: ∂M/∂z.
+        basis: the functions of position there.
+        slopes: their derivatives with respect to z.
+
+    References: Murray (2016), arXiv:1602.07527, eq. 8 (derivative of a Cholesky factor).
+    """
+    m = mass.shape[1]
+    factor = np.linalg.cholesky(mass)
+    inverse = np.linalg.inv(factor)[:, None]
+    moved = inverse @ np.moveaxis(change, -1, 1) @ inverse.swapaxes(-1, -2)  # (B, nz, m, m)
+    moved = factor[:, None] @ (np.tril(moved) - np.eye(m) * moved / 2)
+    rows = np.concatenate([basis, *np.moveaxis(slopes, -1, 0)])
+    right = np.concatenate([factor, *moved.swapaxes(0, 1)]).reshape(-1, m**2)
+    size = np.linalg.norm(rows, axis=0)
+    size[size == 0] = 1
+    found = np.linalg.lstsq(rows / size, right, rcond=PRECISE)[0] / size[:, None]
+    return np.asarray(found.T.reshape(m, m, -1))
 
 
 @dataclass(frozen=True)

@@ -34,5 +34,10 @@ class Iterate:
 
     @property
     def rank(self) -> tuple[bool, int, float]:
-        """The smaller the better: proper first, then by step of the work, then by validation loss."""
-        return (not self.proper, -self.step, self.validation_loss)
+        """The smaller the better: proper first, then by step of the work, then by both losses, multiplied.
+
+        A validation block at the edge of the data asks for what training never saw: there the best of models
+        may be as far off as a poor one, and only the training loss tells them apart. Where noise is fitted,
+        it is the validation loss that grows by much.
+        """
+        return (not self.proper, -self.step, self.loss * self.validation_loss)

@@ -81,7 +81,7 @@ class StructuredNetworks:
         return self._forward(self.unpack(theta), data).residual
 
     def _forward(self, weights: dict[str, Array], data: Assembly) -> _Forward:
-        basis, slopes = self._basis(weights, data)
+        basis, slopes = self.basis(weights, data)
         outputs, gradients = _outputs(weights, basis, slopes)
         f, df = self._terms(outputs, gradients)
         residual = np.einsum("bnt,bt->bn", data.value, f) - data.target
@@ -105,7 +105,12 @@ class StructuredNetworks:
             force[:, :, -1], slope[:, :, -1] = at * fall, (1 - at**2) * fall
         return force, slope
 
-    def _basis(
+    def friction(self, weights: dict[str, Array], data: Assembly) -> Float[Array, "B n f"]:
+        """Forces of viscous friction, of each friction unit and of drag, before their strengths."""
+        s, v = friction_width(weights), data.velocity[:, :, None]
+        return np.concatenate([v, s * self._slip(v / s)[0], v * np.abs(v)], axis=2)
+
+    def basis(
         self, weights: dict[str, Array], data: Assembly
     ) -> tuple[Float[Array, "B H"], Float[Array, "B H nz"]]:
         """[1, z, products, tanh(Wz + b)] and derivatives."""

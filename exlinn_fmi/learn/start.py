@@ -5,28 +5,43 @@ V) and viscous D the residual is linear in all unknowns: one solve gives M, coup
 friction at once. A row without input is homogeneous, so that noise or too poor a basis can shrink it until
 M is not positive definite; then the start is a plain diagonal M instead. Such rows weigh no more than their
 power: a larger weight would shrink them further.
+
+With the hidden units as they were drawn the same solve gives starts for functions of position that are no
+short polynomials (`hidden_starts`): coefficients on functions that are fixed are found to the last digits
+where a descent from silent units takes hundreds of iterations.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from exlinn_fmi.learn.assembly import Assembly, product_basis
-from exlinn_fmi.learn.factor import fit_factor
-from exlinn_fmi.learn.networks import coupling_columns
-from exlinn_fmi.mechanics.layout import Layout
+from exlinn_fmi.learn.factor import fit_cholesky, fit_factor
+from exlinn_fmi.learn.levenberg import triangle
+from exlinn_fmi.learn.networks import StructuredNetworks, coupling_columns
+from exlinn_fmi.mechanics.layout import Layout, Mask
 
 Array = NDArray[np.float64]
+Basis = tuple[Array, Array]
+"""Functions of position at the samples (B, k), and their derivatives with respect to z (B, k, nz)."""
 
 SAMPLES = 4000
 """About as many samples does the solve look at."""
 CUT = 1e-10
 """Singular values below this share of the largest are gauges."""
+CUTS = (1e-2, 1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
+"""The same for starts that are judged by validation."""
+OVERLAP = 0.25
+"""Slope of a hidden unit on a line times the distance to the next, …"""
+LEAST_SLOPE = 1.0
+"""… and least slope: flatter ones would all be straight."""
 SHARE = 0.1
 """ε as a share of the smallest mass in the solution."""
 LEAST = 1e-2
@@ -35,6 +50,10 @@ PLAIN = 0.3
 """Mass and friction where the solution is of no use, as a share of the forces in its equation."""
 NONE = 1e-6
 """Masses below this share of the forces in their equation are taken for none."""
+FRICTION = ("viscous", "friction", "quadratic")
+"""Weights of friction, in the order in which it is solved for."""
+SILENT = 1e-9
+"""Friction that a solve does without begins with this share of the forces: from 0 it could not grow."""
 JOIN = 0.02
 """First weight of friction units, relative to the viscous one: small, so that they join without a jolt."""
 
@@ -47,18 +66,22 @@ class Start(NamedTuple):
 
 
 class _Solution(NamedTuple):
-    """Coefficients of A and V by term, K, offsets, viscous friction, M at the samples, sizes of forces."""
+    """Coefficients of A and V by term, K, offsets, friction, M and ∂M/∂z at the samples, sizes of forces.
+
+    Friction of each velocity: viscous, then that of its units and quadratic drag.
+    """
 
     functions: dict[tuple[str, int, int], Array]
     coupling: Array
     offset: Array
-    viscous: Array
+    friction: Float[Array, "n f"]
     mass: Float[Array, "B n n"]
+    change: Float[Array, "B n n nz"]
     forces: Float[Array, " n"]
 
 
 def linear_start(layout: Layout, data: Assembly, seed: int) -> Start:
-    """Weights to start from.
+    """Weights to start from, hidden units silent.
 
     Args:
         layout: of the networks.
@@ -66,93 +89,186 @@ def linear_start(layout: Layout, data: Assembly, seed: int) -> Start:
         seed: of all that is drawn.
     """
     part = data.part(slice(None, None, -(-len(data) // SAMPLES)))
-    found = _solve(layout, part)
+    pairs = list(combinations_with_replacement(range(part.z.shape[1]), 2))
+    masks = [layout.term_mask(t, pairs if t[0] == "M" else layout.products) for t in layout.terms]
+    friction = part.velocity[:, :, None] * layout.free["dissipation.viscous"][:, None]
+    bases = product_basis(part.z, pairs), (part.basis, part.slopes)
+    found = next(_solve(layout, part, *bases, masks, friction, (CUT,)))
     random = np.random.default_rng(seed)
     weights = {name: np.zeros(shape) for name, shape in layout.shapes.items()}
     epsilon = np.zeros(len(found.forces))
     output = weights["lagrangian.output"]
     for block, columns in zip(layout.blocks, layout.columns, strict=True):
-        mass, epsilon[block] = _mass_block(found.mass[:, block][:, :, block], found.forces[block])
+        mass, _, epsilon[block] = _mass_block(found, block)
         used = np.flatnonzero(layout.term_mask(("L", block[0], 0), layout.products))
         factor = fit_factor(mass, part.basis[:, used], columns, random)
         for k, i in enumerate(block):
             output[layout.rows[i], used] = factor[k]
-    for row, term in enumerate(layout.outputs):
-        if term in found.functions:
-            output[row, 1 : 1 + len(found.functions[term])] = found.functions[term]
-    weights["lagrangian.coupling"][:] = found.coupling
-    weights["lagrangian.offset"][:] = found.offset
-    viscous = np.where(found.viscous > LEAST * found.forces, found.viscous, PLAIN * LEAST * found.forces)
-    weights["dissipation.viscous"][:] = np.sqrt(viscous)
-    weights["dissipation.friction"][:] = JOIN * np.sqrt(viscous)[:, None]
+    believed = found.friction > LEAST * found.forces[:, None]
+    friction = np.where(believed, found.friction, PLAIN * LEAST * found.forces[:, None])
+    _fill(layout, weights, found)
+    weights["dissipation.viscous"][:] = np.sqrt(friction[:, 0])
+    weights["dissipation.friction"][:] = JOIN * np.sqrt(friction)
+    weights["dissipation.quadratic"][:] = JOIN * np.sqrt(friction[:, 0])
     smooth = layout.friction - layout.bumps
     weights["dissipation.width"][:, :smooth] = np.log(np.geomspace(0.1, 1.0, smooth))
     weights["dissipation.width"][:, smooth:] = np.log(0.1)
-    weights["dissipation.quadratic"][:] = JOIN * np.sqrt(viscous)
-    # Each unit's transition lies somewhere in the range of its inputs, which is [-1, 1].
-    slope = weights["lagrangian.hidden.weight"]
-    slope[:] = 1.5 * random.standard_normal(slope.shape)
-    weights["lagrangian.hidden.bias"][:] = -(slope * random.uniform(-1, 1, slope.shape)).sum(axis=1)
+    _draw_units(layout, weights, random)
     return Start(weights, tuple(epsilon.tolist()))
 
 
-def _solve(layout: Layout, part: Assembly) -> _Solution:
-    """Weighted linear least squares for everything at once."""
-    n, free = part.velocity.shape[1], layout.free
-    pairs = list(combinations_with_replacement(range(part.z.shape[1]), 2))
-    bases, columns = [], []
-    for t, term in enumerate(layout.terms):
-        if term[0] == "M":
-            used = layout.term_mask(term, pairs)
-            basis, slopes = product_basis(part.z, pairs)
-        else:  # constants have no effect there
-            used = layout.term_mask(term, layout.products)[1:]
-            basis, slopes = part.basis[:, 1:], part.slopes[:, 1:]
-        basis, slopes = basis * used, slopes * used[:, None]
-        column = part.value[:, :, t, None] * basis[:, None]
-        columns.append(column + np.einsum("bnz,bhz->bnh", part.gradient[:, :, t], slopes))
-        bases.append(basis)
-    columns += [
-        coupling_columns(layout, part.velocity) * free["lagrangian.coupling"],
-        -np.broadcast_to(np.eye(n), (len(part), n, n)) * free["lagrangian.offset"],
-        part.velocity[:, :, None] * np.eye(n) * free["dissipation.viscous"],
+def hidden_starts(
+    networks: StructuredNetworks, weights: dict[str, Array], data: Assembly
+) -> Iterator[dict[str, Array]]:
+    """Weights to start from with hidden units that take part from the first: better, or far too rich.
+
+    The more singular values a solve keeps, the closer it is to clean data and the further off on others.
+
+    Args:
+        networks: with their smallest masses ε.
+        weights: whose hidden units are taken as they are.
+        data: coefficients of the inverse model.
+    """
+    layout, part = networks.spec.layout, data.part(slice(None, None, -(-len(data) // SAMPLES)))
+    free, basis = layout.free, networks.basis(weights, part)
+    rows = {term: mask for term, mask in zip(layout.outputs, free["lagrangian.output"], strict=True)}
+    masks = [rows[("L", i, 0) if kind == "M" else (kind, i, j)] for kind, i, j in layout.terms]
+    kinds = [
+        free[f"dissipation.{kind}"].reshape(len(weights["dissipation.viscous"]), -1) for kind in FRICTION
     ]
+    friction = networks.friction(weights, part) * np.concatenate(kinds, axis=1)
+    epsilon = np.array(networks.spec.epsilon)
+    for found in _solve(layout, part, basis, basis, masks, friction, CUTS):
+        now = {name: array.copy() for name, array in weights.items()}
+        output = now["lagrangian.output"]
+        output[:] = 0
+        for block in layout.blocks:
+            mass, change, least = _mass_block(found, block)
+            room = mass + np.diag(least - epsilon[block])  # M − ε, with the ε that the model has
+            if not np.linalg.eigvalsh(room).min() > 0:
+                break
+            used = np.flatnonzero(rows["L", block[0], 0])
+            factor = fit_cholesky(room, change, basis[0][:, used], basis[1][:, used])
+            for k, i in enumerate(block):
+                output[layout.rows[i]][: len(block), used] = factor[k]
+        else:
+            _fill(layout, now, found)
+            strength = np.sqrt(np.maximum(found.friction, SILENT * found.forces[:, None]))
+            now["dissipation.viscous"][:], now["dissipation.quadratic"][:] = strength[:, [0, -1]].T
+            now["dissipation.friction"][:] = strength[:, 1:-1]
+            yield now
+
+
+def _draw_units(layout: Layout, weights: dict[str, Array], random: np.random.Generator) -> None:
+    """Hidden units whose transitions lie in the range of their inputs, [-1, 1].
+
+    On a line they stand in equal distances, so wide that they overlap well: then sums of them hold a smooth
+    function to many digits with coefficients of its own size.
+    """
+    slope, bias = weights["lagrangian.hidden.weight"], weights["lagrangian.hidden.bias"]
+    slope[:] = 1.5 * random.standard_normal(slope.shape) * layout.free["lagrangian.hidden.weight"]
+    bias[:] = -(slope * random.uniform(-1, 1, slope.shape)).sum(axis=1)
+    for seen in set(layout.sight):
+        units = np.flatnonzero([sight == seen for sight in layout.sight])
+        inputs = [k for k, owner in enumerate(layout.owners) if owner in seen]
+        if len(inputs) == 1 and len(units) > 1:
+            steep = max(OVERLAP * (len(units) - 1) / 2, LEAST_SLOPE)
+            slope[units, inputs], bias[units] = steep, -steep * np.linspace(-1, 1, len(units))
+
+
+def _fill(layout: Layout, weights: dict[str, Array], found: _Solution) -> None:
+    """Put A, V, K and offsets into the weights."""
+    for row, term in enumerate(layout.outputs):
+        if term in found.functions:
+            weights["lagrangian.output"][row, : len(found.functions[term])] = found.functions[term]
+    weights["lagrangian.coupling"][:] = found.coupling
+    weights["lagrangian.offset"][:] = found.offset
+
+
+def _solve(
+    layout: Layout,
+    part: Assembly,
+    mass_basis: Basis,
+    basis: Basis,
+    masks: Sequence[Mask],
+    friction: Float[Array, "B n f"],
+    cuts: Sequence[float],
+) -> Iterator[_Solution]:
+    """Weighted linear least squares for everything at once, for each cut of the singular values.
+
+    Friction, which must not be negative, is solved for on what the others leave open.
+
+    Args:
+        layout: of the networks.
+        part: the samples.
+        mass_basis: functions of position for M, and their derivatives.
+        basis: those for A and V, where the first, a constant, has no effect.
+        masks: for each term which of its functions may take part.
+        friction: friction of each velocity in its own equation.
+        cuts: singular values below this share of the largest are left out.
+    """
+    n, free = part.velocity.shape[1], layout.free
+    bases: list[Basis] = []
+    columns = []
+    for t, (term, mask) in enumerate(zip(layout.terms, masks, strict=True)):
+        used = mask if term[0] == "M" else mask & (np.arange(len(mask)) > 0)
+        values, slopes = mass_basis if term[0] == "M" else basis
+        values, slopes = values * used, slopes * used[:, None]
+        column = part.value[:, :, t, None] * values[:, None]
+        columns.append(column + np.einsum("bnz,bhz->bnh", part.gradient[:, :, t], slopes))
+        bases.append((values, slopes))
+    columns.append(coupling_columns(layout, part.velocity) * free["lagrangian.coupling"])
+    columns.append(-np.broadcast_to(np.eye(n), (len(part), n, n)) * free["lagrangian.offset"])
+    columns.append((friction[:, :, None] * np.eye(n)[:, :, None]).reshape(len(part), n, -1))
     size = np.sqrt(np.mean(part.target**2, axis=0))
     weight = 1 / np.where(size > 0, size, 1)
     matrix = (np.concatenate(columns, axis=2) * weight[:, None]).reshape(part.target.size, -1)
     size = np.linalg.norm(matrix, axis=0)
     size[size == 0] = 1
-    solution = np.linalg.lstsq(matrix / size, (part.target * weight).ravel(), rcond=CUT)[0] / size
-    parts = np.split(solution, np.cumsum([c.shape[2] for c in columns])[:-1])
-    mass = np.zeros((len(part), n, n))
-    for (kind, i, j), basis, coefficients in zip(layout.terms, bases, parts, strict=False):
-        if kind == "M":
-            mass[:, i, j] = mass[:, j, i] = basis @ coefficients
-    shares = [part.target, *(c @ x for c, x in zip(columns, parts, strict=True))]
-    forces = np.max([np.sqrt(np.mean(share**2, axis=0)) for share in shares], axis=0)
-    forces = np.maximum(forces, np.finfo(float).eps * forces.max())
-    functions = {term: x for term, x in zip(layout.terms, parts, strict=False) if term[0] != "M"}
-    coupling, offset, viscous = parts[-3:]
-    return _Solution(functions, coupling, offset, viscous, mass, forces)
+    free = matrix.shape[1] - columns[-1].shape[2]
+    r = triangle(np.column_stack([matrix / size, (part.target * weight).ravel()]))
+    left, singular, right = np.linalg.svd(r[:free, :free])
+    for cut in cuts:
+        strong = singular > cut * singular.max()
+        kept, lost = left[:, strong], left[:, ~strong]
+        rest = np.concatenate([lost.T @ r[:free, free:], r[free:, free:]])
+        solution = np.empty(len(size))
+        solution[free:] = nnls(rest[:, :-1], rest[:, -1])[0]
+        target = kept.T @ (r[:free, -1] - r[:free, free:-1] @ solution[free:])
+        solution[:free] = right[strong].T @ (target / singular[strong])
+        parts = np.split(solution / size, np.cumsum([c.shape[2] for c in columns])[:-1])
+        mass, change = np.zeros((len(part), n, n)), np.zeros((len(part), n, n, part.z.shape[1]))
+        for (kind, i, j), (values, slopes), x in zip(layout.terms, bases, parts, strict=False):
+            if kind == "M":
+                mass[:, i, j] = mass[:, j, i] = values @ x
+                change[:, i, j] = change[:, j, i] = np.einsum("bhz,h->bz", slopes, x)
+        shares = [part.target, *(c @ x for c, x in zip(columns, parts, strict=True))]
+        forces = np.max([np.sqrt(np.mean(share**2, axis=0)) for share in shares], axis=0)
+        forces = np.maximum(forces, np.finfo(float).eps * forces.max())
+        functions = {term: x for term, x in zip(layout.terms, parts, strict=False) if term[0] != "M"}
+        coupling, offset, friction_found = parts[-3:]
+        yield _Solution(functions, coupling, offset, friction_found.reshape(n, -1), mass, change, forces)
 
 
 def _mass_block(
-    mass: Float[Array, "B m m"], forces: Float[Array, " m"]
-) -> tuple[Float[Array, "B m m"], Float[Array, " m"]]:
-    """A block of M less ε, and ε.
+    found: _Solution, block: list[int]
+) -> tuple[Float[Array, "B m m"], Float[Array, "B m m nz"], Float[Array, " m"]]:
+    """A block of M less ε, its derivatives, and ε.
 
     The block is drawn towards its mean as far as it is not positive definite everywhere; if not even the mean
     is, a plain diagonal takes its place.
     """
+    mass, change = found.mass[:, block][:, :, block], found.change[:, block][:, :, block]
+    forces = found.forces[block]
     if not _believed(mass.mean(axis=0), forces):
-        mass = np.broadcast_to(np.diag(PLAIN * forces), mass.shape)
+        mass, change = np.broadcast_to(np.diag(PLAIN * forces), mass.shape), np.zeros_like(change)
     mean = mass.mean(axis=0)
     diagonal = np.diag(mean)
     unit = np.sqrt(np.outer(diagonal, diagonal))
     smallest, least = (float(np.linalg.eigvalsh(matrix / unit).min()) for matrix in (mean, mass))
     share = 1.0 if least > smallest / 2 else smallest / (2 * (smallest - least))
     epsilon = SHARE * max(least, smallest / 2) * diagonal
-    return mean + share * (mass - mean) - np.diag(epsilon), epsilon
+    return mean + share * (mass - mean) - np.diag(epsilon), share * change, epsilon
 
 
 def _believed(mean: Float[Array, "m m"], forces: Float[Array, " m"]) -> bool:

@@ -170,7 +170,7 @@ class Structured(Spec):
     hidden: int = Field(8, ge=1, le=512, description="units of the hidden layer of each network")
     iterations: int = Field(300, ge=1, description="most Levenberg–Marquardt iterations")
     target: NonNegative = Field(1e-20, description="stop when the scaled training loss is below this")
-    regularisation: NonNegative = Field(1e-16, description="λ of the L2 term")
+    regularisation: NonNegative = Field(1e-24, description="λ of the L2 term")
 
 
 class Terms(Spec):

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from learn_helpers import motor_cart_dataset
 
-from exlinn_fmi.learn.factor import fit_factor
+from exlinn_fmi.learn.factor import fit_cholesky, fit_factor
 from exlinn_fmi.learn.structured import iterate_structured, structured_spec
 from exlinn_fmi.scenario.learning import Structured
 
@@ -42,6 +42,20 @@ def test_a_factor_is_found_again_whatever_it_was(seed: int) -> None:
     mass = squared(truth, basis)
     found = squared(fit_factor(mass, basis, 3, random), basis)
     assert np.sqrt(np.mean((found - mass) ** 2)) < 1e-3 * np.abs(mass).max()
+
+
+def test_a_cholesky_factor_on_a_rich_basis_squares_to_mass_and_its_derivative() -> None:
+    x = np.linspace(-1, 1, 200)
+    powers = np.arange(25)
+    basis = np.polynomial.chebyshev.chebvander(x, 24)
+    slopes = np.stack([np.polynomial.chebyshev.Chebyshev.basis(k).deriv()(x) for k in powers], axis=1)
+    mass = np.stack([[2 + np.sin(x), 0.3 * x], [0.3 * x, 1 + x**2 / 2]]).transpose(2, 0, 1)
+    change = np.stack([[np.cos(x), 0.3 + 0 * x], [0.3 + 0 * x, x]]).transpose(2, 0, 1)
+    found = fit_cholesky(mass, change[..., None], basis, slopes[..., None])
+    assert np.abs(squared(found, basis) - mass).max() < 1e-10
+    factor, moved = (np.einsum("ick,bk->bic", found, b) for b in (basis, slopes))
+    half = moved @ factor.transpose(0, 2, 1)
+    assert np.abs(half + half.transpose(0, 2, 1) - change).max() < 1e-8
 
 
 def test_units_of_the_coordinates_do_not_matter() -> None:

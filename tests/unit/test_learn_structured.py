@@ -52,7 +52,8 @@ def test_training_says_how_it_ended_and_what_it_was_made_of() -> None:
     assert list(model.history["iteration"]) == list(range(len(model.history)))
     assert model.provenance["seed"] == 0
     assert model.provenance["method"]["preset"] == "structured"
-    assert model.provenance["validation_loss"] == model.history["validation_loss"].min()
+    rank = model.history["loss"] * model.history["validation_loss"]
+    assert model.provenance["loss"] * model.provenance["validation_loss"] == rank.min()
     assert len(model.provenance["data_sha256"]) == 64
 
 
@@ -61,8 +62,10 @@ def test_the_same_seed_gives_the_same_weights() -> None:
     assert all((again.weights[name] == array).all() for name, array in learned(1).weights.items())
 
 
-def test_a_solenoid_is_learned_by_the_same_code() -> None:
-    model = train(*split(solenoid_dataset(), 0.8, 10, 1), OPTIONS.model_copy(update={"iterations": 60}), 1)
+@pytest.mark.parametrize("seed", range(6))
+def test_a_solenoid_is_learned_by_the_same_code_from_any_seed(seed: int) -> None:
+    options = OPTIONS.model_copy(update={"iterations": 60})
+    model = train(*split(solenoid_dataset(), 0.8, 10, seed), options, seed)
     test = solenoid_dataset(seed=7)
     inner = test.frame["x"].between(*np.quantile(solenoid_dataset().frame["x"], [0.02, 0.98]))
     error = force_error(model.system, test)[inner.to_numpy()]
@@ -97,10 +100,10 @@ def test_a_stop_keeps_the_best_weights_so_far() -> None:
     model = train(*parts, OPTIONS, 0, seen.append, lambda: len(seen) == 4)
     assert model.status == "interrupted"
     assert len(model.history) == 4
-    assert model.provenance["validation_loss"] == min(p.validation_loss for p in seen)
+    assert model.provenance["validation_loss"] in [p.validation_loss for p in seen]
     spec, start = structured_spec(parts[0], OPTIONS, 0)
     iterates = [it for it, _ in zip(iterate_structured(spec, start, *parts, OPTIONS), range(4), strict=False)]
-    best = min(iterates, key=lambda it: it.validation_loss)
+    best = min(iterates, key=lambda it: it.rank)
     assert all((model.weights[name] == array).all() for name, array in best.weights.items())
 
 
