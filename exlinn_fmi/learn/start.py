@@ -131,7 +131,7 @@ def hidden_starts(
     """
     layout, part = networks.spec.layout, data.part(slice(None, None, -(-len(data) // SAMPLES)))
     free, basis = layout.free, networks.basis(weights, part)
-    rows = {term: mask for term, mask in zip(layout.outputs, free["lagrangian.output"], strict=True)}
+    rows = dict(zip(layout.outputs, free["lagrangian.output"], strict=True))
     masks = [rows[("L", i, 0) if kind == "M" else (kind, i, j)] for kind, i, j in layout.terms]
     kinds = [
         free[f"dissipation.{kind}"].reshape(len(weights["dissipation.viscous"]), -1) for kind in FRICTION
