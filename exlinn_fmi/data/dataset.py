@@ -2,12 +2,13 @@
 
 Columns: ``trajectory`` (int), ``time`` [s], positions that are not cyclic, velocities, accelerations,
     inputs, all by their names in `Coordinate`; further columns (energies, …) may follow. Rows of a
-    trajectory stand together, in the order of time.
+    trajectory stand together, in the order of time. Beside an acceleration that was estimated stands its
+    input as ``<input>_matched``: with the same filter over it (`estimate_missing`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +19,7 @@ import pandas as pd
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike, NDArray
 
-from exlinn_fmi.data.derivatives import derivative
+from exlinn_fmi.data.derivatives import SHORTEST, Between, best_window, derivative, integral
 from exlinn_fmi.data.files import read_json, read_table, write_json, write_table
 from exlinn_fmi.errors import DataError
 from exlinn_fmi.mechanics.coordinates import (
@@ -34,7 +35,10 @@ MINIMUM_ROWS = 20
 
 
 class Samples(NamedTuple):
-    """q [unit of q], v = q̇, a = q̈ and generalised forces F, shape (N, n); cyclic q and absent F are 0."""
+    """q [unit of q], v = q̇, a = q̈ and generalised forces F, shape (N, n); cyclic q and absent F are 0.
+
+    Forces are those that belong to the accelerations: matched ones where those were estimated.
+    """
 
     q: Float[NDArray[np.float64], "N n"]
     v: Float[NDArray[np.float64], "N n"]
@@ -106,14 +110,24 @@ class Dataset:
     def arrays(self) -> Samples:
         """The samples as arrays."""
         shape = (len(self.frame), len(self.coordinates))
-        q, v, a, force = (np.zeros(shape) for _ in range(4))
+        q, v, a = (np.zeros(shape) for _ in range(3))
         for i, c in enumerate(self.coordinates):
             if c.topology != "cyclic":
                 q[:, i] = self.frame[c.name]
             v[:, i], a[:, i] = self.frame[c.velocity], self.frame[c.acceleration]
+        return Samples(q, v, a, self._forces(matched))
+
+    @cached_property
+    def recorded_forces(self) -> Float[NDArray[np.float64], "N n"]:
+        """Generalised forces as recorded, matched to no acceleration; 0 where none acts."""
+        return self._forces(str)
+
+    def _forces(self, name: Callable[[str], str]) -> Float[NDArray[np.float64], "N n"]:
+        force = np.zeros((len(self.frame), len(self.coordinates)))
+        for i, c in enumerate(self.coordinates):
             if c.input is not None:
-                force[:, i] = self.frame[c.input]
-        return Samples(q, v, a, force)
+                force[:, i] = self.frame[name(c.input) if name(c.input) in self.frame else c.input]
+        return force
 
     @property
     def trajectories(self) -> list[int]:
@@ -134,6 +148,11 @@ class Dataset:
         """The data set of some of the trajectories."""
         chosen = self.frame["trajectory"].isin(list(trajectories))
         return Dataset(self.frame[chosen], self.coordinates, self.units)
+
+
+def matched(name: str) -> str:
+    """Column of an input with the filter over it that made its coordinate's acceleration."""
+    return f"{name}_matched"
 
 
 def required_columns(coordinates: tuple[Coordinate, ...]) -> list[str]:
@@ -200,12 +219,19 @@ def _pick(
 # ── missing columns ──────────────────────────────────────────────────────────────────────────────────────
 
 
-def estimate_missing(frame: pd.DataFrame, coordinates: tuple[Coordinate, ...]) -> pd.DataFrame:
+def estimate_missing(
+    frame: pd.DataFrame, coordinates: tuple[Coordinate, ...], between: Between = "hold"
+) -> pd.DataFrame:
     """Fill in velocities from positions and accelerations from velocities, for each trajectory apart.
+
+    The derivative of sampled velocities is a mean of the acceleration over a window. Where inputs are held,
+    and jump at the rows, it is that of the input over the same window that it belongs to, not the one at the
+    row, which begins to act there: so the filter goes over the input's integral as well.
 
     Args:
         frame: with ``trajectory``, ``time`` and at least the positions, or the velocities where cyclic.
         coordinates: the generalised coordinates.
+        between: how inputs go from row to row.
 
     Raises:
         DataError: a column is missing that cannot be estimated, or a trajectory is too short for it.
@@ -224,24 +250,33 @@ def estimate_missing(frame: pd.DataFrame, coordinates: tuple[Coordinate, ...]) -
                 _check_columns(frame, source)
                 _check_time(frame)
                 order = 2 if target == c.acceleration and source[-1] == c.name else 1
-                frame[target] = _by_trajectory(frame, source[-1], order)
+                driven = c.input if target == c.acceleration and c.input in frame else None
+                _estimate(frame, source[-1], target, order, driven, between)
             elif target == c.velocity:
                 source.append(target)
     return frame
 
 
-def _by_trajectory(frame: pd.DataFrame, column: str, order: int) -> NDArray[np.float64]:
-    """Time derivative of a column, each trajectory apart."""
-    values = np.empty(len(frame))
+def _estimate(
+    frame: pd.DataFrame, column: str, target: str, order: int, driven: str | None, between: Between
+) -> None:
+    """Put the time derivative of a column, each trajectory apart, into another; match the input that acts."""
+    found, seen = np.empty(len(frame)), np.empty(len(frame))
+    if driven is not None:
+        _check_columns(frame, [driven])
     for number in frame["trajectory"].unique():
         rows = np.flatnonzero(frame["trajectory"] == number)
+        names = ["time", column, driven or "time"]
+        time, values, force = frame[names].iloc[rows].to_numpy(dtype=float).T
         try:
-            values[rows] = derivative(
-                frame["time"].to_numpy(dtype=float)[rows], frame[column].to_numpy(dtype=float)[rows], order
-            )
+            window = best_window(values, order) if len(rows) >= SHORTEST else None
+            found[rows] = derivative(time, values, order, window)
         except DataError as error:
             raise DataError(f"data set: column {column!r} of trajectory {number}: {error}") from error
-    return values
+        seen[rows] = derivative(time, integral(time, force, between, order), order, window)
+    frame[target] = found
+    if driven is not None:
+        frame[matched(driven)] = seen
 
 
 # ── checks ───────────────────────────────────────────────────────────────────────────────────────────────

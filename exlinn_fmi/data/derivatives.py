@@ -13,6 +13,7 @@ References: Savitzky, Golay (1964), Anal. Chem. 36, 1627; Goldenshluger, Nemirov
 from __future__ import annotations
 
 from math import comb
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -32,6 +33,8 @@ EVEN = 1e-3
 """Sampling steps may differ by this share of their median."""
 
 Signal = Float[NDArray[np.float64], " N"]
+Between = Literal["hold", "linear"]
+"""How an input goes from row to row."""
 
 
 def derivative(time: Signal, values: Signal, order: int = 1, window: int | None = None) -> Signal:
@@ -62,6 +65,23 @@ def derivative(time: Signal, values: Signal, order: int = 1, window: int | None 
         )
     size = best_window(values, order) if window is None else window
     return np.asarray(_filter(values, size, order) / step**order)
+
+
+def integral(time: Signal, values: Signal, between: Between, order: int = 1) -> Signal:
+    """Integral of a sampled signal from the first row on, once or twice.
+
+    Args:
+        time: sampling times [s].
+        values: the signal.
+        between: ``hold``: it keeps its value to the next row; ``linear``: it goes there on a straight line.
+        order: 1 or 2.
+    """
+    h, now = np.diff(time), values[:-1]
+    after = now if between == "hold" else values[1:]
+    once = np.concatenate([[0.0], np.cumsum(h * (now + after) / 2)])
+    if order == 1:
+        return once
+    return np.concatenate([[0.0], np.cumsum(h * once[:-1] + h**2 * (2 * now + after) / 6)])
 
 
 def noise_level(values: Signal) -> float:

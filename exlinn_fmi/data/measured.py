@@ -17,7 +17,7 @@ import pandas as pd
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from exlinn_fmi.data.dataset import Dataset, estimate_missing, required_columns
+from exlinn_fmi.data.dataset import Dataset, estimate_missing, matched, required_columns
 from exlinn_fmi.data.derivatives import EVEN, SHORTEST
 from exlinn_fmi.data.doubts import Recording, check_recordings, doubts
 from exlinn_fmi.data.foreign import ForeignTable, column_names, read_foreign
@@ -60,18 +60,21 @@ def import_measured(data: Measured, coordinates: tuple[Coordinate, ...], folder:
     count, inputs = len(training), input_names(coordinates)
     notes = [note for recording in recordings for note in recording.table.notes] + _estimated(recordings)
     notes += check_recordings(recordings[:count], recordings[count:], coordinates)
+    grid = as_grid(data)
+    between = "hold" if grid is None else grid.inputs
     groups: list[list[pd.DataFrame]] = []
     for recording in recordings:
         parts, more = regular(recording, data, inputs)
-        parts = [estimate_missing(part.assign(trajectory=0), coordinates) for part in parts]
+        parts = [estimate_missing(part.assign(trajectory=0), coordinates, between) for part in parts]
         groups.append([low_pass(part, data.filter, recording.name) for part in parts])
         notes += more
     measured = set.intersection(*(set(recording.frame.columns) for recording in recordings))
     notes += doubts([part for group in groups[:count] for part in group], coordinates, measured)
-    grid = as_grid(data)
     frames = [part if grid is None else resample(part, grid, inputs) for group in groups for part in group]
     numbered = [frame.assign(trajectory=number) for number, frame in enumerate(frames)]
-    frame = pd.concat(numbered, ignore_index=True)[required_columns(coordinates)]
+    frame = pd.concat(numbered, ignore_index=True)
+    kept = required_columns(coordinates)
+    frame = frame[kept + [name for name in map(matched, inputs) if name in frame]]
     first = sum(map(len, groups[:count]))
     dataset = Dataset(frame, coordinates, held_out=tuple(range(first, len(frames))))
     return replace(dataset, notes=tuple(notes if tests else [*notes, NO_TEST]))

@@ -108,10 +108,9 @@ def force_error(system: LagrangianSystem, data: Dataset) -> Float[Array, "N n"]:
 
 
 def accelerations(system: LagrangianSystem, data: Dataset) -> Float[Array, "N n"]:
-    """Accelerations of the forward model (16) at the measured states under the recorded inputs."""
-    q, v, _, _ = data.arrays
-    inputs = data.frame[system.input_names].to_numpy(dtype=float)
-    return evaluate(system.forward, q, v, inputs, NONE)
+    """Accelerations of the forward model (16) at the measured states under the inputs."""
+    q, v, _, force = data.arrays
+    return evaluate(system.forward, q, v, force @ system.input_matrix, NONE)
 
 
 def _least_mass(system: LagrangianSystem, data: Dataset) -> float:

@@ -111,7 +111,8 @@ def weak_regression(basis: MonomialBasis, data: Dataset, p: Float[Array, " P"] |
     """
     scale, at = force_scale(data), basis.start if p is None else p
     momenta, rest = basis.momenta, basis.rest
-    q, v, _, force = data.arrays
+    q, v, _, _ = data.arrays
+    force = data.recorded_forces
     columns, forces = [], []
     for rows, phi, slope, held in _windows(data):
         shape = (len(rows), v.shape[1], len(at))

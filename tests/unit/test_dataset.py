@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from exlinn_fmi.data.dataset import (
     Dataset,
     check_excitation,
+    estimate_missing,
     load_dataset,
     required_columns,
     save_dataset,
@@ -149,6 +150,40 @@ def test_missing_velocity_and_acceleration_are_estimated_from_the_position() -> 
     time = data.frame["time"].to_numpy()
     assert data.frame["alpha_dot"].to_numpy() == pytest.approx(np.cos(time), abs=1e-8)
     assert data.frame["alpha_ddot"].to_numpy() == pytest.approx(-np.sin(time), abs=1e-6)
+
+
+@pytest.mark.parametrize(("between", "linear"), [("hold", False), ("linear", True)])
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_input_beside_an_estimated_acceleration_is_what_acted_in_its_window(
+    between: str, linear: bool, order: int
+) -> None:
+    # m ẍ = u and l i̇ = u, integrated exactly: only the same filter over the input gives masses to the digits.
+    random, h = np.random.default_rng(0), 0.01
+    u = random.standard_normal((200, 2))
+    later = np.vstack([u[1:], u[-1:]]) if linear else u
+    v = np.vstack([np.zeros(2), np.cumsum(h * (u + later)[:-1] / 2, axis=0)])
+    x = np.concatenate([[0.0], np.cumsum(h * v[:-1, 0] + h**2 * (2 * u + later)[:-1, 0] / 6)])
+    rows = {
+        "trajectory": 0,
+        "time": np.arange(200) * h,
+        "x": x / 2,
+        "i": v[:, 1] / 3,
+        "F": u[:, 0],
+        "v": u[:, 1],
+    }
+    columns = pd.DataFrame(rows | ({"x_dot": v[:, 0] / 2} if order == 1 else {}))
+    coordinates = (Coordinate("x", "m", input="F", input_unit="N"), COORDINATES[1])
+    samples = Dataset(estimate_missing(columns, coordinates, between), coordinates).arrays
+    assert 2 * samples.a[:, 0] == pytest.approx(samples.F[:, 0], abs=1e-8)
+    assert 3 * samples.a[:, 1] == pytest.approx(samples.F[:, 1], abs=1e-9)
+
+
+def test_recorded_forces_and_measured_accelerations_are_left_alone() -> None:
+    assert (DATA.recorded_forces == DATA.arrays.F).all()
+    columns = {name: column for name, column in frame().items() if name != "i_dot"}
+    data = Dataset.from_columns(columns, COORDINATES)
+    assert (data.recorded_forces[:, 1] == frame()["v"]).all()
+    assert "v_matched" in data.select([0]).frame
 
 
 def test_a_missing_current_cannot_be_estimated() -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exlinn_fmi.data.derivatives import SHORTEST, best_window, derivative, noise_level
+from exlinn_fmi.data.derivatives import SHORTEST, best_window, derivative, integral, noise_level
 from exlinn_fmi.errors import DataError
 
 TIME = np.arange(4001) * 1e-3
@@ -78,3 +78,16 @@ def test_uneven_steps_are_refused_with_the_row() -> None:
     time[100:] += 5e-3
     with pytest.raises(DataError, match=r"row 100 .* step 0.006 s, expected 0.001 s"):
         derivative(time, SIGNAL)
+
+
+# ── inputs that belong to estimated derivatives ──────────────────────────────────────────────────────────
+
+
+def test_integrals_of_held_and_straight_inputs_are_exact() -> None:
+    time = np.array([0.0, 1.0, 1.5, 3.0])
+    values = np.array([2.0, 4.0, -2.0, 1.0])
+    assert integral(time, values, "hold") == pytest.approx([0, 2, 4, 1])
+    assert integral(time, values, "hold", 2) == pytest.approx([0, 1, 1 + 1 + 0.5, 2.5 + 6 - 2.25])
+    straight = 3 * time - 1
+    assert integral(time, straight, "linear") == pytest.approx(1.5 * time**2 - time)
+    assert integral(time, straight, "linear", 2) == pytest.approx(0.5 * time**3 - time**2 / 2)

@@ -14,12 +14,13 @@ from learn_helpers import MOTOR_CART, motor_cart, motor_cart_dataset, solenoid_d
 from exlinn_fmi.data.dataset import Dataset, split
 from exlinn_fmi.errors import DataError, TrainingError
 from exlinn_fmi.learn.card import force_error
+from exlinn_fmi.learn.identify import identify
 from exlinn_fmi.learn.rollout import free_run, nrmse
 from exlinn_fmi.learn.start import linear_start
 from exlinn_fmi.learn.structured import iterate_structured, structured_spec
 from exlinn_fmi.learn.train import TrainedModel, TrainProgress, train
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
-from exlinn_fmi.scenario.learning import Structured
+from exlinn_fmi.scenario.learning import Identify, Structured
 
 OPTIONS = Structured(preset="structured")
 SHORT = OPTIONS.model_copy(update={"iterations": 5})
@@ -72,6 +73,21 @@ def test_a_solenoid_is_learned_by_the_same_code_from_any_seed(seed: int) -> None
     assert np.mean(error[:, 1] ** 2) < 1e-8 * test.frame["v"].var()
     mass = evaluate(model.system.mass_matrix, *test.arrays[:2], np.zeros(0))
     assert np.abs(mass[:, 0, 0] / 0.1 - 1).max() < 1e-3
+
+
+def test_parameters_are_found_without_accelerations_though_inputs_jump_from_row_to_row() -> None:
+    full = motor_cart_dataset()
+    columns = {name: full.frame[name] for name in full.frame if name not in ("alpha_ddot", "i_dot")}
+    data = Dataset.from_columns(columns, MOTOR_CART)
+    model = train(*split(data, 0.8, 10, 0), OPTIONS, 0, objective="inverse")
+    terms = Identify(
+        lagrangian={"j": "0.5*alpha_dot^2", "l": "0.5*i^2", "k": "i*alpha"},
+        dissipation={"b": "0.5*alpha_dot^2", "r": "0.5*i^2"},
+    )
+    terms.lagrangian["m"] = "0.5*sin(alpha)^2*alpha_dot^2"
+    found = identify(model.system, data, terms, {}).parameters.set_index("name")["identified"]
+    expected = {"j": 0.1, "l": 1.0, "k": 1.0, "m": 0.04, "b": 0.5, "r": 5.0}
+    assert found.to_dict() == pytest.approx(expected, rel=1e-3)
 
 
 def test_units_do_not_change_what_is_learned() -> None:
