@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from exlinn_fmi import cli_export
 from exlinn_fmi.errors import ExlinnError, InputError, Interrupted, StorageError
 
 if TYPE_CHECKING:
@@ -205,53 +206,7 @@ def report(
     typer.echo(str(pipeline.report(folder)))
 
 
-export_app = typer.Typer(
-    help="Write an FMU without Python inside.\n\nExample: exlinn export plant dc_motor_cart",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
-app.add_typer(export_app, name="export")
-
-
-@export_app.command("plant")
-def export_plant_command(
-    name: Annotated[str, typer.Argument(help="Name of the plant, e.g. dc_motor_cart.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", help="FMU to write; <ModelName>.fmu if not given.")
-    ] = None,
-) -> None:
-    """Build a plant page as an FMU (FMI 2.0, Co-Simulation and Model Exchange). Needs a C compiler.
-
-    Example: exlinn export plant dc_motor_cart --out fmus/DCMotorCart.fmu
-    """
-    from exlinn_fmi.export.build import export_plant
-    from exlinn_fmi.plants import plant
-
-    page = plant(name)
-    typer.echo(str(export_plant(page, out or Path(f"{page.model_name}.fmu"))))
-
-
-@export_app.command("model")
-def export_model_command(
-    folder: Annotated[
-        Path, typer.Argument(help="Run folder, or any folder with model.json.", metavar="FOLDER")
-    ],
-    out: Annotated[
-        Path | None, typer.Option("--out", help="FMU to write; <folder name>.fmu if not given.")
-    ] = None,
-) -> None:
-    """Build a learned model as an FMU (FMI 2.0, Co-Simulation and Model Exchange). Needs a C compiler.
-
-    Example: exlinn export model runs/dcwc_tracking --out Learned.fmu
-    """
-    from exlinn_fmi.export.build import export_system
-    from exlinn_fmi.factory import model_system
-
-    system = model_system(str(folder.resolve()), Path(), folder)
-    file = out or Path(f"{folder.resolve().name}.fmu")
-    typer.echo(
-        str(export_system(system, file, name=file.stem, description="learned extended Lagrangian model"))
-    )
+app.add_typer(cli_export.app, name="export")
 
 
 @app.command()

@@ -22,7 +22,7 @@ from pathlib import Path
 from exlinn_fmi.errors import InputError, RunError
 
 # Linux alone would otherwise let a library through that lacks a symbol.
-PLATFORM_FLAGS = {"linux": ("-fPIC", "-Wl,-z,defs"), "darwin": ("-fPIC",)}
+PLATFORM_FLAGS = {"linux": ("-fPIC", "-Wl,-z,defs", "-lm"), "darwin": ("-fPIC",)}
 
 
 def find_compiler(compiler: str | None = None) -> list[str]:
@@ -54,7 +54,12 @@ def find_compiler(compiler: str | None = None) -> list[str]:
 
 
 def compile_library(
-    sources: Mapping[str, bytes], main: str, name: str, flags: Sequence[str], compiler: list[str]
+    sources: Mapping[str, bytes],
+    main: str,
+    name: str,
+    flags: Sequence[str],
+    compiler: list[str],
+    system: str = sys.platform,
 ) -> bytes:
     """Compile C sources to a shared library that holds no path of this machine, debug information included.
 
@@ -64,6 +69,7 @@ def compile_library(
         name: file name of the library, which some platforms write into it.
         flags: besides those that a shared library needs.
         compiler: its command line.
+        system: what it compiles for, as `sys.platform` calls it.
 
     Raises:
         RunError: with what the compiler said.
@@ -71,8 +77,8 @@ def compile_library(
     with tempfile.TemporaryDirectory(prefix="exlinn-build-") as folder:
         for file, content in sources.items():
             (Path(folder) / file).write_bytes(content)
-        fixed = ("-shared", *PLATFORM_FLAGS.get(sys.platform, ()), f"-ffile-prefix-map={folder}=.")
-        command = [*compiler, *flags, *fixed, main, "-o", name, "-lm"]
+        fixed = (f"-ffile-prefix-map={folder}=.", "-o", name, *PLATFORM_FLAGS.get(system, ()))
+        command = [*compiler, "-shared", *flags, main, *fixed]
         result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if result.returncode:
             said = (result.stderr or result.stdout).strip()[:4000]

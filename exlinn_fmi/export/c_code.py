@@ -2,50 +2,46 @@
 
 from __future__ import annotations
 
-import hashlib
 from importlib import resources
 from pathlib import Path
 
 import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
 
 from exlinn_fmi.export.model import StateSpaceModel
-from exlinn_fmi.export.model_description import model_description
 
-HEADERS = ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h")
+SOURCE = "all.c"
+"""The one file to compile."""
+
+HEADERS = {
+    2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
+    3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
+}
 """FMI's own headers (2-clause BSD, the notice is inside), as FMPy ships them."""
 
 
-def fmu_texts(model: StateSpaceModel) -> dict[str, str]:
-    """Every text file of the FMU by its path: modelDescription.xml and sources, bound together by a token.
-
-    The token is a hash of them all: with this modelDescription.xml no binary of other sources will work.
+def sources(model: StateSpaceModel, fmi: int, token: str) -> dict[str, str]:
+    """The C files by name.
 
     Args:
         model: what to export.
+        fmi: major version of FMI.
+        token: what the binary knows modelDescription.xml by.
     """
-    texts = {f"sources/{name}": text for name, text in _sources(model).items()}
-    digest = hashlib.sha256(model_description(model, "").encode())
-    for name in sorted(texts):
-        digest.update(f"{name}\n{texts[name]}".encode())
-    token = f"{{{digest.hexdigest()[:32]}}}"
-    texts["sources/model.h"] = texts["sources/model.h"].replace('MODEL_TOKEN ""', f'MODEL_TOKEN "{token}"')
-    return {"modelDescription.xml": model_description(model, token), **texts}
-
-
-def _sources(model: StateSpaceModel) -> dict[str, str]:
-    """The C files by name, the token still empty."""
     import fmpy
 
     headers = Path(fmpy.__file__).parent / "c-code"
     templates = resources.files("exlinn_fmi.export") / "templates"
+    names = [SOURCE, "core.c", "instance.c", f"fmi{fmi}.c", *(["network.c"] if model.network else [])]
     return {
-        **{name: (headers / name).read_text("utf-8") for name in HEADERS},
-        **{file.name: file.read_text("utf-8") for file in templates.iterdir() if file.name.endswith(".c")},
-        **_generated(model),
+        **{name: (headers / name).read_text("utf-8") for name in HEADERS[fmi]},
+        **{name: (templates / name).read_text("utf-8") for name in names},
+        **_generated(model, fmi, token),
     }
 
 
-def _generated(model: StateSpaceModel) -> dict[str, str]:
+def _generated(model: StateSpaceModel, fmi: int, token: str) -> dict[str, str]:
     """equations.c, written by CasADi, and model.h, the constants that the templates are compiled with."""
     functions = _functions(model)
     generator = ca.CodeGenerator(
@@ -53,48 +49,69 @@ def _generated(model: StateSpaceModel) -> dict[str, str]:
     )
     for function in functions:
         generator.add(function)
-    return {"equations.c": generator.dump(), "model.h": _constants(model, functions)}
+    return {"equations.c": generator.dump(), "model.h": _constants(model, functions, fmi, token)}
 
 
 def _functions(model: StateSpaceModel) -> tuple[ca.Function, ...]:
-    """For the integrator z → ẋ, then z → (ẋ, y), and the derivative of the latter along a direction."""
-    z = ca.SX.sym("z", len(model.known))
-    direction = ca.SX.sym("direction", len(model.known))
-    unknown = model.equations(z)
-    tangent = ca.densify(ca.jtimes(unknown, z, direction))
+    """For the integrator z → ẋ, then z → (ẋ, y) and the latter's derivatives along a direction and back.
+
+    With a network inside they take, and the last one gives, what concerns the network as well.
+    """
+    z, seed = ca.SX.sym("z", len(model.known)), ca.SX.sym("seed", len(model.known))
+    weight = ca.SX.sym("weight", len(model.unknown))
+    known, direction = [z], [seed]
+    if model.network is not None:
+        known.append(ca.SX.sym("r", model.network.size))
+        direction.append(ca.SX.sym("change", model.network.size))
+    unknown, all_known = model.equations(*known), ca.vertcat(*known)
+    tangent = ca.densify(ca.jtimes(unknown, all_known, ca.vertcat(*direction)))
+    back = ca.densify(ca.jtimes(unknown, all_known, weight, True))
     formulas = {
-        "derivative": ([z], unknown[: len(model.states)]),
-        "evaluate": ([z], unknown),
-        "tangent": ([z, direction], tangent),
+        "derivative": (known, [unknown[: len(model.states)]]),
+        "evaluate": (known, [unknown]),
+        "tangent": ([*known, *direction], [tangent]),
+        "adjoint": (
+            [*known, weight],
+            ca.vertsplit(back, [0, z.shape[0], back.shape[0]]) if len(known) > 1 else [back],
+        ),
     }
+    if model.features is not None:
+        features, pull = model.features(z), ca.SX.sym("pull", model.features.size1_out(0))
+        formulas |= {
+            "features": ([z], [features]),
+            "features_tangent": ([z, seed], [ca.densify(ca.jtimes(features, z, seed))]),
+            "features_adjoint": ([z, pull], [ca.densify(ca.jtimes(features, z, pull, True))]),
+        }
     return tuple(
-        ca.Function(f"{model.identifier}_{name}", arguments, [ca.cse(value)])
-        for name, (arguments, value) in formulas.items()
+        ca.Function(f"{model.identifier}_{name}", arguments, ca.cse(values))
+        for name, (arguments, values) in formulas.items()
     )
 
 
-def _constants(model: StateSpaceModel, functions: tuple[ca.Function, ...]) -> str:
+def _constants(model: StateSpaceModel, functions: tuple[ca.Function, ...], fmi: int, token: str) -> str:
     """model.h: names, start values, sizes, and the work space that the generated functions need."""
     sizes = {
         "NX": len(model.states),
         "NU": len(model.inputs),
         "NP": len(model.parameters),
         "NY": len(model.outputs),
-        "N_ARG": max(2, *(f.sz_arg() for f in functions)),
-        "N_RES": max(1, *(f.sz_res() for f in functions)),
+        "N_POSITIONS": len(model.velocity_of),
+        "N_ARG": max(4, *(f.sz_arg() for f in functions)),
+        "N_RES": max(2, *(f.sz_res() for f in functions)),
         "N_IW": max(1, *(f.sz_iw() for f in functions)),
         "N_W": max(1, *(f.sz_w() for f in functions)),
     }
     names = "\n".join(f'    "{variable.name}",' for variable in model.variables)
-    start = "\n".join(
-        f"    {float(variable.start)!r}, /* {variable.name} */"
-        for variable in model.variables[: len(model.known) + 1]
-    )
+    started = model.known + model.settings
+    start = "\n".join(f"    {float(q.start)!r}, /* {q.name} */" for q in started)
     return f"""\
 /* Names, sizes and start values of {model.identifier}. Generated by exlinn_fmi. */
+#define FMI {fmi}
 #define MODEL_IDENTIFIER "{model.identifier}"
-#define MODEL_TOKEN ""
+#define MODEL_TOKEN "{token}"
 #define MODEL_FUNCTION(name) {model.identifier}_##name
+#define RANGED {int(bool(model.ranges))}
+#define NETWORK {int(model.network is not None)}
 
 enum {{ {", ".join(f"{name} = {size}" for name, size in sizes.items())} }};
 
@@ -103,8 +120,63 @@ static const char *const NAMES[] = {{
 {names}
 }};
 
-/* Start values of states, inputs, parameters and solver_step, by value reference. */
+/* Start values of states, inputs, parameters and settings, by value reference. */
 static const double START[] = {{
 {start}
 }};
+
+/* Orders of magnitude of the states. */
+{_array("NOMINAL", [q.nominal for q in model.states])}
+/* The velocity that each position moves with, by value reference. */
+{_array("VELOCITY_OF", model.velocity_of or (0,), "int")}
+{_ranges(model)}{_network(model)}"""
+
+
+def _array(name: str, values: ArrayLike, kind: str = "double") -> str:
+    """A constant array; numbers are written so that they are read back to the last bit."""
+    flat = np.ravel(values).tolist()
+    texts = [float(v).hex() if kind == "double" and len(flat) > 64 else repr(v) for v in flat]
+    rows = [", ".join(texts[k : k + 6]) for k in range(0, len(texts), 6)]
+    return f"static const {kind} {name}[] = {{\n    " + ",\n    ".join(rows) + "\n};\n"
+
+
+def _ranges(model: StateSpaceModel) -> str:
+    """What the model was trained with."""
+    if not model.ranges:
+        return ""
+    names = [q.name for q in model.known]
+    low, high = zip(*model.ranges.values(), strict=True)
+    return f"""
+/* Ranges that the model was trained in, and the value references they belong to. */
+enum {{ N_RANGES = {len(low)} }};
+{_array("RANGE_OF", [names.index(name) for name in model.ranges], "int")}\
+{_array("LOW", np.array(low, dtype=float))}{_array("HIGH", np.array(high, dtype=float))}"""
+
+
+def _network(model: StateSpaceModel) -> str:
+    """The network as data."""
+    network = model.network
+    if network is None:
+        return ""
+    widths = [network.inputs, *(len(bias) for _, bias in network.layers)]
+    arrays = [
+        _array(f"WEIGHT_{k}", weight.T) + _array(f"BIAS_{k}", bias)
+        for k, (weight, bias) in enumerate(network.layers)
+    ]
+    count = len(network.layers)
+    outputs = len(network.output)
+    sizes = {
+        "N_FEATURES": network.inputs,
+        "N_LAYERS": count,
+        "N_OUTPUTS": outputs,
+        "N_NETWORK": network.size,
+        "MAX_WIDTH": max(widths),
+    }
+    return f"""
+/* The network: weights input by input, biases, and the weights of its outputs. */
+#define ACTIVATION_TANH {int(network.activation == "tanh")}
+enum {{ {", ".join(f"{name} = {size}" for name, size in sizes.items())} }};
+{_array("WIDTH", widths, "int")}{"".join(arrays)}{_array(f"WEIGHT_{count}", network.output.T)}\
+static const double *const WEIGHT[] = {{{", ".join(f"WEIGHT_{k}" for k in range(count + 1))}}};
+static const double *const BIAS[] = {{{", ".join(f"BIAS_{k}" for k in range(count))}}};
 """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 
@@ -28,6 +29,14 @@ _COHERENT: dict[str, dict[str, int]] = {
     "H": {"kg": 1, "m": 2, "s": -2, "A": -2},
 }
 """Units without a factor: a value in them is a value in base units."""
+
+
+DISPLAY = {
+    "rad": ("deg", 180 / math.pi),
+    "rad/s": ("deg/s", 180 / math.pi),
+    "rad/s2": ("deg/s2", 180 / math.pi),
+}
+"""Units that people would rather see another way: what it is called, and how many make one."""
 
 
 def base_exponents(unit: str) -> dict[str, int]:

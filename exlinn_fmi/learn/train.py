@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from exlinn_fmi.data.dataset import Dataset, check_excitation, required_columns
 from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.iterate import Iterate
+from exlinn_fmi.mechanics.coordinates import input_names, state_names
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.learned import ModelSpec, learned_system
 from exlinn_fmi.mechanics.structure import UNKNOWN, Structure
@@ -59,7 +60,7 @@ class TrainedModel:
         status: ``converged``: nothing more was to be gained; ``iterations``: all that were allowed are done;
             ``interrupted``: stopped by the user. The weights are the best on the validation data in any case.
         seconds: training time [s].
-        provenance: seed, settings, losses and hash of the data.
+        provenance: seed, settings, losses, hash of the data and the range of each state and input in them.
     """
 
     spec: ModelSpec
@@ -130,6 +131,7 @@ def train(
         "validation_loss": best.validation_loss,
         "samples": len(train),
         "data_sha256": _data_hash(train),
+        "ranges": _ranges(train),
         **best.notes,
     }
     history = pd.DataFrame(rows, columns=HISTORY)
@@ -162,6 +164,12 @@ def _learner(
 
     spec, start = structured_spec(train, method, seed, structure)
     return spec, iterate_structured(spec, start, train, validation, method), method.iterations
+
+
+def _ranges(train: Dataset) -> dict[str, tuple[float, float]]:
+    """Smallest and largest value of each state and input."""
+    names = [*state_names(train.coordinates), *input_names(train.coordinates)]
+    return {name: (float(train.frame[name].min()), float(train.frame[name].max())) for name in names}
 
 
 def _data_hash(dataset: Dataset) -> str:

@@ -285,8 +285,7 @@ class LagrangianSystem:
                 f"the equations are not finite at the start state and {which} parameters; "
                 "check the parameters and the start values"
             )
-        fastest = float(np.max(np.abs(np.linalg.eigvals(poles))))
-        return _round_down(min(MAX_INTERNAL_STEP, 0.01 / fastest if fastest > 0 else MAX_INTERNAL_STEP))
+        return longest_step(poles)
 
     @cached_property
     def output(self) -> ca.Function:
@@ -342,6 +341,16 @@ def _solve_blocks(matrix: Symbol, right: Symbol) -> Symbol:
         for k, i in enumerate(members):
             solution[i] = part[k]
     return ca.vertcat(*solution)
+
+
+def longest_step(jacobian: NDArray[np.float64]) -> float:
+    """Longest RK4 step [s] that `LagrangianSystem.solver_step` allows.
+
+    Args:
+        jacobian: ∂ẋ/∂x, whose eigenvalues are the poles, shape (k, k).
+    """
+    fastest = float(np.max(np.abs(np.linalg.eigvals(jacobian))))
+    return _round_down(min(MAX_INTERNAL_STEP, 0.01 / fastest if fastest > 0 else MAX_INTERNAL_STEP))
 
 
 def _round_down(value: float) -> float:

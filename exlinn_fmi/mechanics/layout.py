@@ -84,6 +84,7 @@ class Layout:
         order = sorted(range(n), key=lambda i: (topologies[i] == "cyclic", kinds[i] == "electrical", i))
         self.couplings = [(order[b], order[a]) for a in range(n) for b in range(a + 1, n)]
         self.hidden = spec.hidden if self.positions else 0
+        self.depth = spec.depth
         self.basis = 1 + len(self.owners) + len(self.products) + self.hidden
         self.coordinates, self.structure = spec.coordinates, spec.structure
         seen = self._sights()
@@ -119,6 +120,11 @@ class Layout:
         return {
             "lagrangian.hidden.weight": (self.hidden, len(self.owners)),
             "lagrangian.hidden.bias": (self.hidden,),
+            **{
+                f"lagrangian.hidden_{layer}.{part}": (self.hidden,) * rank
+                for layer in range(2, self.depth + 1)
+                for part, rank in (("weight", 2), ("bias", 1))
+            },
             "lagrangian.output": (len(self.outputs), self.basis),
             "lagrangian.coupling": (len(self.couplings),),
             "lagrangian.offset": (n,),

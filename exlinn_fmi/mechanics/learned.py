@@ -22,7 +22,7 @@ Networks see dimensionless quantities only: `Scales` carries the units, so that 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -97,6 +97,7 @@ class ModelSpec:
         dissipation_features: monomials for D (features and terms).
         structure: which energies the plant has; what it has not, the structured networks have not either.
         inside: parameters inside functions of the monomials (terms), and where they were looked for.
+        depth: hidden layers of a structured model, all of `hidden` units; what is trained here has one.
     """
 
     form: Literal["structured", "features", "terms"]
@@ -108,6 +109,7 @@ class ModelSpec:
     dissipation_features: tuple[str, ...] = ()
     structure: Structure = UNKNOWN
     inside: tuple[tuple[str, float], ...] = ()
+    depth: int = 1
 
     def __post_init__(self) -> None:
         check_coordinates(self.coordinates)
@@ -217,8 +219,8 @@ def learned_system(spec: ModelSpec, weights: Weights) -> LagrangianSystem:
         )
     return LagrangianSystem.build(
         spec.coordinates,
-        lambda q, v, p: _structured_lagrangian(spec, weights, q, v),
-        lambda v, p: _structured_dissipation(spec, weights, v),
+        lambda q, v, p: structured_lagrangian(spec, weights, q, v),
+        lambda v, p: structured_dissipation(spec, weights, v),
     )
 
 
@@ -272,25 +274,45 @@ def saturate(z: Symbol) -> Symbol:
     return z - ca.sign(z) * (beyond - ca.tanh(beyond))
 
 
-def _structured_lagrangian(spec: ModelSpec, weights: Weights, q: Symbol, v: Symbol) -> Symbol:
-    """𝓛 of the structured form [J]."""
+def hidden_layers(
+    spec: ModelSpec, weights: Weights
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Weights and biases of each hidden layer of the structured 𝓛."""
+    for name in ("hidden", *(f"hidden_{layer}" for layer in range(2, spec.depth + 1))):
+        yield weights[f"lagrangian.{name}.weight"], weights[f"lagrangian.{name}.bias"]
+
+
+def structured_lagrangian(
+    spec: ModelSpec, weights: Weights, q: Symbol, v: Symbol, network: Symbol | None = None
+) -> Symbol:
+    """𝓛 of the structured form [J].
+
+    Args:
+        spec: the model.
+        weights: its weights.
+        q: coordinates, a symbol or expression (n).
+        v: velocities (n).
+        network: what the hidden units give to each output, if it is known from elsewhere.
+    """
     assert spec.scales is not None
     layout, scales = spec.layout, spec.scales
     z = topology_features(spec, q)
     x, w = q / ca.DM(scales.position), v / ca.DM(scales.velocity)
     products = [math.prod(z[a] for a in product) for product in layout.products]
-    hidden = ca.tanh(
-        ca.mtimes(ca.DM(weights["lagrangian.hidden.weight"]), z) + ca.DM(weights["lagrangian.hidden.bias"])
-    )
+    hidden = z
+    for weight, bias in hidden_layers(spec, weights) if network is None else ():
+        hidden = ca.tanh(ca.mtimes(ca.DM(weight), hidden) + ca.DM(bias))
     basis = ca.vertcat(1, z, *products, hidden) if layout.positions else ca.SX(1)
     output = weights["lagrangian.output"]
+    if network is not None:
+        basis, output = ca.vertcat(1, z, *products), output[:, : layout.basis - layout.hidden]
     momentum: dict[
         tuple[int, int], Symbol
     ] = {}  # (block, column) → Σᵢ L_ic w_i, so that ½ Σ_c (…)² = ½ wᵀLLᵀw
     energy = ca.SX(0)
     block_of = {i: b for b, block in enumerate(layout.blocks) for i in block}
     for row, (kind, i, c) in enumerate(layout.outputs):
-        value = ca.mtimes(ca.DM(output[row : row + 1]), basis)
+        value = ca.mtimes(ca.DM(output[row : row + 1]), basis) + (0 if network is None else network[row])
         if kind == "L":
             key = (block_of[i], c)
             momentum[key] = momentum.get(key, 0) + value * w[i]
@@ -303,8 +325,8 @@ def _structured_lagrangian(spec: ModelSpec, weights: Weights, q: Symbol, v: Symb
     return scales.energy * energy
 
 
-def _structured_dissipation(spec: ModelSpec, weights: Weights, v: Symbol) -> Symbol:
-    """D of the structured form [W]."""
+def structured_dissipation(spec: ModelSpec, weights: Weights, v: Symbol) -> Symbol:
+    """D of the structured form [W]; arguments as for `structured_lagrangian`."""
     assert spec.scales is not None
     viscous, friction = weights["dissipation.viscous"], weights["dissipation.friction"]
     width, quadratic = friction_width(weights), weights["dissipation.quadratic"]

@@ -82,6 +82,7 @@ class Plant:
         dissipation: (v, p) → D.
         outputs: (Point) → outputs beyond the state and the accelerations, which every plant gives.
         start: initial state by name, 0 where not given.
+        usual: the range that each input usually moves in, by name.
     """
 
     name: str
@@ -93,6 +94,7 @@ class Plant:
     dissipation: Callable[[Symbol, Any], Symbol]
     outputs: Callable[[Point], tuple[Output, ...]] = lambda point: ()
     start: dict[str, float] = field(default_factory=dict)
+    usual: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @cached_property
     def system(self) -> LagrangianSystem:

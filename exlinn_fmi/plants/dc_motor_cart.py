@@ -68,4 +68,5 @@ PLANT = Plant(
     energies=energies,
     dissipation=dissipation,
     outputs=outputs,
+    usual={"tau_ext": (-1.0, 1.0), "v": (-24.0, 24.0)},
 )

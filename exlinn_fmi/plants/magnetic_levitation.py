@@ -78,4 +78,5 @@ PLANT = Plant(
     dissipation=dissipation,
     outputs=outputs,
     start={"x": 0.02, "i": 2 * sqrt(0.02 * 0.05 * 9.81 / 0.1)},
+    usual={"F_ext": (-0.1, 0.1), "v": (6.0, 12.0)},
 )

@@ -83,4 +83,5 @@ PLANT = Plant(
     energies=energies,
     dissipation=dissipation,
     outputs=outputs,
+    usual={"F_ext": (-0.003, 0.003), "v": (-1200.0, 1200.0)},
 )

@@ -78,4 +78,5 @@ PLANT = Plant(
     energies=energies,
     dissipation=dissipation,
     outputs=outputs,
+    usual={"tau_ext": (-0.2, 0.2), "v": (-12.0, 12.0)},
 )

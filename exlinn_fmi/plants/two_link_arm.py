@@ -89,4 +89,5 @@ PLANT = Plant(
     energies=energies,
     dissipation=dissipation,
     outputs=outputs,
+    usual={"tau_1": (-1.0, 1.0), "tau_2": (-0.5, 0.5), "v_1": (-24.0, 24.0), "v_2": (-24.0, 24.0)},
 )

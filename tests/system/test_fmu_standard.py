@@ -146,7 +146,7 @@ def test_foreign_bytes_are_no_state(cs: Instance) -> None:
 def test_a_parameter_has_no_directional_derivative(cs: Instance) -> None:
     cs.start()
     r = cs.references["r"]
-    message = f"value reference {r} is no derivative or output"
+    message = f"value reference {r} is no state, derivative or output"
     refused(cs, message, cs.fmu.getDirectionalDerivative, [r], [0], [1.0])
 
 
@@ -289,15 +289,16 @@ def test_an_output_that_is_no_number_is_refused_by_name(cs: Instance) -> None:
 
 
 def test_an_unknown_value_reference_is_refused(cs: Instance) -> None:
-    refused(cs, "there is no value reference 99, the last one is 23", cs.fmu.getReal, [99])
-    refused(cs, "there is no value reference 99, the last one is 23", cs.fmu.setReal, [99], [1.0])
+    refused(cs, "there is no value reference 99, the last one is 25", cs.fmu.getReal, [99])
+    refused(cs, "there is no value reference 99, the last one is 25", cs.fmu.setReal, [99], [1.0])
 
 
 def test_what_the_model_description_denies_is_refused(cs: Instance) -> None:
     cs.start()
-    v = [cs.references["v"]]
-    refused(cs, "canInterpolateInputs is false", cs.fmu.setRealInputDerivatives, v, [1], [1.0])
-    refused(cs, "maxOutputDerivativeOrder is 0", cs.fmu.getRealOutputDerivatives, v, [1])
+    v, x = [cs.references["v"]], [cs.references["x"]]
+    refused(cs, "order 1 to 3 can be followed, 4 was given", cs.fmu.setRealInputDerivatives, v, [4], [1.0])
+    refused(cs, "value reference .* is no input", cs.fmu.setRealInputDerivatives, x, [1], [1.0])
+    refused(cs, "maxOutputDerivativeOrder is 1", cs.fmu.getRealOutputDerivatives, x, [2])
     refused(cs, "steps are never pending", cs.fmu.cancelStep)
 
 
@@ -308,13 +309,71 @@ def test_the_last_successful_time_is_reported(cs: Instance) -> None:
     assert cs.fmu.getBooleanStatus(3) is False
 
 
-@pytest.mark.parametrize("type_name", ["Integer", "Boolean", "String"])
+@pytest.mark.parametrize("type_name", ["Integer", "String"])
 def test_variables_of_another_type_are_refused(cs: Instance, type_name: str) -> None:
-    refused(cs, "all variables of this model are of type Real", getattr(cs.fmu, f"get{type_name}"), [0])
+    refused(cs, f"has no variables of type {type_name}", getattr(cs.fmu, f"get{type_name}"), [0])
+
+
+def test_a_real_variable_is_no_boolean(cs: Instance) -> None:
+    refused(cs, "alpha is of type real", cs.fmu.getBoolean, [0])
+
+
+def test_input_derivatives_are_followed_within_the_step(cs: Instance) -> None:
+    """v = 2 + 30 t − 40 t² over 100 ms, against the same polynomial cut into steps of 0.1 ms."""
+    cs.start({**X0, "solver_step": 1e-4})
+    cs.set("v", 2.0)
+    v = [cs.references["v"]] * 2
+    cs.fmu.setRealInputDerivatives(v, [1, 2], [30.0, -80.0])
+    cs.fmu.doStep(0.0, 0.1)
+    once, (end,) = cs.get(*STATES), cs.get("v")
+    assert end == pytest.approx(2 + 30 * 0.1 - 40 * 0.01)
+    cs.fmu.reset()
+    cs.start({**X0, "solver_step": 1e-4})
+    t = 1e-4 * (np.arange(1000) + 0.5)
+    cut = cs.run(STATES, 1e-4, {"v": 2 + 30 * t - 40 * t**2})
+    np.testing.assert_allclose(once, cut[-1], rtol=1e-7)
+
+
+def test_input_derivatives_hold_for_one_step(cs: Instance) -> None:
+    cs.start()
+    cs.fmu.setRealInputDerivatives([cs.references["v"]], [1], [10.0])
+    cs.fmu.doStep(0.0, 0.1)
+    cs.fmu.doStep(0.1, 0.1)
+    assert cs.get("v") == [pytest.approx(1.0)]
+
+
+def test_output_derivatives_are_those_of_the_run(cs: Instance) -> None:
+    names = ["alpha", "x", "tau_e", "alpha_ddot"]
+    cs.start(X0)
+    cs.set("v", 5.0)
+    given = cs.fmu.getRealOutputDerivatives([cs.references[n] for n in names], [1] * 4)
+    before = np.array(cs.get(*names))
+    cs.fmu.doStep(0.0, 1e-6)
+    np.testing.assert_allclose(list(given), (np.array(cs.get(*names)) - before) / 1e-6, rtol=1e-4)
+
+
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-7, 1e-10])
+def test_adaptive_steps_keep_their_tolerance(cs: Instance, tolerance: float) -> None:
+    cs.start({**X0, "solver_step": 1e-4})
+    fine = cs.run(STATES, 0.1, {"v": np.full(20, 5.0)})
+    cs.fmu.reset()
+    cs.start({**X0, "solver_tolerance": tolerance})
+    difference = np.abs(cs.run(STATES, 0.1, {"v": np.full(20, 5.0)}) - fine).max()
+    assert difference < 20 * tolerance
+    assert difference > 1e-15
+
+
+def test_adaptive_steps_name_a_state_that_cannot_be_followed(cs: Instance) -> None:
+    cs.start({"alpha_dot": 1e150, "solver_tolerance": 1e-6})
+    refused(cs, "cannot be followed in the step from t = 0 s to 1 s", cs.fmu.doStep, 0.0, 1.0)
+
+
+def test_the_tolerance_must_be_below_one(cs: Instance) -> None:
+    refused(cs, "solver_tolerance was set to 1, expected 0", cs.set, "solver_tolerance", 1.0)
 
 
 def test_a_foreign_guid_is_refused(fmu: Path) -> None:
     log: list[str] = []
     with pytest.raises(Exception, match="instantiate"):
         Instance(fmu, guid="{0%s}", log=log)
-    assert "the guid is {0?s}, expected {" in log[-1]
+    assert "the token is {0?s}, expected {" in log[-1]

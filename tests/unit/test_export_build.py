@@ -14,6 +14,7 @@ from export_helpers import instance
 from exlinn_fmi import export
 from exlinn_fmi.errors import RunError, StorageError
 from exlinn_fmi.export import export_plant, export_system
+from exlinn_fmi.export.build import Options
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.learned import ModelSpec, Scales, learned_system
@@ -84,7 +85,7 @@ def test_a_compiler_that_fails_is_quoted_and_nothing_is_written(tmp_path: Path) 
     script.write_text("#!/bin/sh\necho 'out of stamps' >&2\nexit 1\n")
     script.chmod(script.stat().st_mode | stat.S_IXUSR)
     with pytest.raises(RunError, match=r"the C compiler failed: .*all\.c.*\nout of stamps\n"):
-        export_plant(PLANT, tmp_path / "x.fmu", compiler=str(script))
+        export_plant(PLANT, tmp_path / "x.fmu", Options(compiler=str(script)))
     assert not (tmp_path / "x.fmu").exists()
 
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from exlinn_fmi.errors import ModelError
-from exlinn_fmi.export.c_code import fmu_texts
+from exlinn_fmi.export.contents import fmu_members
 from exlinn_fmi.export.model import StateSpaceModel, plant_model, system_model
 from exlinn_fmi.export.model_description import model_description
 from exlinn_fmi.mechanics.coordinates import Coordinate, Parameter
@@ -71,9 +71,11 @@ def test_any_system_exports_with_its_energy_as_output() -> None:
         "s_dot",
         "f",
         "solver_step",
+        "solver_tolerance",
         "der(s)",
         "s_ddot",
         "energy",
+        "time",
     ]
     assert [q.start for q in model.states] == [0.5, 0.0]
     np.testing.assert_allclose(evaluate(model.equations, [0.5, 2.0, 1.0])[0], [2.0, 1.0 - 2.0 - 0.2, 2.5])
@@ -134,7 +136,7 @@ def test_both_interfaces_save_their_state_and_know_derivatives(xml: ET.Element) 
 
 def test_value_reference_is_the_position(xml: ET.Element) -> None:
     references = [int(v.get("valueReference", "")) for v in xml.iter("ScalarVariable")]
-    assert references == list(range(len(MODEL.variables)))
+    assert references == list(range(len(MODEL.variables) - 1))  # the last one is the time, which FMI 3 names
 
 
 def test_parameters_are_tunable_with_the_plants_values(xml: ET.Element) -> None:
@@ -144,7 +146,8 @@ def test_parameters_are_tunable_with_the_plants_values(xml: ET.Element) -> None:
         if v.get("causality") == "parameter"
     }
     expected = {p.name: ("tunable", p.value, p.unit) for p in PLANT.parameters}
-    assert found == {**expected, "solver_step": ("fixed", 1e-3, "s")}
+    settings = {"solver_step": ("fixed", 1e-3, "s"), "solver_tolerance": ("fixed", 0.0, None)}
+    assert found == {**expected, **settings}
 
 
 def test_states_can_be_given_a_start_value(xml: ET.Element) -> None:
@@ -155,7 +158,7 @@ def test_states_can_be_given_a_start_value(xml: ET.Element) -> None:
 
 def test_every_unit_is_defined_in_base_units(xml: ET.Element) -> None:
     defined = {u.get("name") for u in xml.iterfind("UnitDefinitions/Unit") if u.find("BaseUnit") is not None}
-    assert defined == {v[0].get("unit") for v in xml.iter("ScalarVariable")}
+    assert defined == {v[0].get("unit") for v in xml.iter("ScalarVariable")} - {None}
 
 
 def test_each_derivative_names_its_state(xml: ET.Element) -> None:
@@ -191,19 +194,19 @@ def test_a_variable_without_unit_or_description_says_none() -> None:
 
 def test_a_unit_that_is_no_si_unit_is_refused() -> None:
     with pytest.raises(ModelError, match="unit 'inch'"):
-        fmu_texts(system_model(oscillator(unit="inch"), "Oscillator"))
+        fmu_members(system_model(oscillator(unit="inch"), "Oscillator"))
 
 
 # ── the sources ──────────────────────────────────────────────────────────────────────────────────────────
 
 
 def token(model: StateSpaceModel) -> str:
-    return ET.fromstring(fmu_texts(model)["modelDescription.xml"]).get("guid", "")
+    return ET.fromstring(fmu_members(model)["modelDescription.xml"]).get("guid", "")
 
 
 def test_the_token_binds_sources_and_description() -> None:
-    texts = fmu_texts(MODEL)
-    assert f'#define MODEL_TOKEN "{token(MODEL)}"' in texts["sources/model.h"]
+    header = fmu_members(MODEL)["sources/model.h"].decode()
+    assert f'#define MODEL_TOKEN "{token(MODEL)}"' in header
 
 
 @pytest.mark.parametrize(

@@ -2,9 +2,18 @@
  *
  *     cc -shared -fPIC -O2 -std=c99 -ffp-contract=off all.c -o MODEL_IDENTIFIER.so -lm
  */
+#include <float.h>
+#include <math.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
 #include "model.h"
 #include "equations.c"
 #include "core.c"
-#include "fmi2_common.c"
-#include "fmi2_model_exchange.c"
-#include "fmi2_co_simulation.c"
+#if FMI == 2
+#include "fmi2.c"
+#else
+#include "fmi3.c"
+#endif
