@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate, state_units
-from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, Symbol, longest_step
+from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, Symbol, bind, longest_step
 from exlinn_fmi.mechanics.expansion import Expansion, Network
 from exlinn_fmi.mechanics.plant import Plant
 
@@ -158,10 +158,34 @@ class StateSpaceModel:
 
     def evaluate(self, known: NDArray[np.float64]) -> NDArray[np.float64]:
         """(ẋ, y) at one z, by CasADi and NumPy: what the C code is to agree with."""
-        if self.network is None or self.features is None:
-            return np.array(self.equations(known)).ravel()
-        given = self.network.value_and_slopes(np.array(self.features(known)).ravel())
-        return np.array(self.equations(known, given)).ravel()
+        return self._evaluator(known)
+
+    @cached_property
+    def _evaluator(self) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+        """`evaluate` on arrays that are tied to the functions once."""
+        z, unknown, network = np.zeros(len(self.known)), np.zeros(len(self.unknown)), self.network
+        if network is None or self.features is None:
+            equations = bind(self.equations, (z,), (unknown,))
+
+            def given() -> None:
+                """Nothing is given but z."""
+
+        else:
+            seen, r = np.zeros(network.inputs), np.zeros(network.size)
+            features = bind(self.features, (z,), (seen,))
+            equations = bind(self.equations, (z, r), (unknown,))
+
+            def given() -> None:
+                features()
+                r[:] = network.value_and_slopes(seen)
+
+        def evaluate(known: NDArray[np.float64]) -> NDArray[np.float64]:
+            z[:] = known
+            given()
+            equations()
+            return unknown.copy()
+
+        return evaluate
 
 
 def _rows(function: ca.Function, argument: int, rows: int) -> list[set[int]]:
