@@ -126,7 +126,7 @@ class StateSpaceModel:
         clamp = "whether states and inputs enter the equations no farther out than the model was trained"
         return (
             Quantity(SOLVER_STEP, "s", step, self.solver_step, "setting"),
-            Quantity("solver_tolerance", "", tolerance, 0.0, "setting"),
+            Quantity("solver_tolerance", "1", tolerance, 0.0, "setting"),
         ) + (Quantity("clamp", "", clamp, role="setting", boolean=True),) * bool(self.ranges)
 
     @property
