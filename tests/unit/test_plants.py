@@ -159,7 +159,7 @@ def test_the_readme_lists_each_variable_of_the_fmu_with_unit_and_start(page: Pla
     shown = [q for q in model.variables if not q.name.startswith("der(") and q.role != "time"]
     expected = {(q.name, q.unit) for q in shown}
     assert {(name, unit) for name, unit, _ in rows} == expected
-    starts = {q.name: q.start for q in model.known} | {"solver_step": model.solver_step, "solver_tolerance": 0.0}
+    starts = {q.name: q.start for q in (*model.known, *model.settings)}
     assert {n: float(s) for n, _, s in rows if s} == pytest.approx(starts, rel=1e-5)
 
 
