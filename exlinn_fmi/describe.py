@@ -55,6 +55,7 @@ def describe_scenario(file: Path, overrides: Sequence[str]) -> str:
     """
     from exlinn_fmi.cosim.graph import Graph
     from exlinn_fmi.factory import outline
+    from exlinn_fmi.scenario.events import event_names
     from exlinn_fmi.scenario.learning import LearnFromData
     from exlinn_fmi.workspace import Run
 
@@ -76,6 +77,11 @@ def describe_scenario(file: Path, overrides: Sequence[str]) -> str:
         lines.append(f"isolated, in processes of their own: {', '.join(apart)}")
     if components:
         lines.append(Graph(components, work.scenario.connection_list()).describe())
+    if work.scenario.events:
+        labels = event_names(work.scenario.events)
+        width = max(map(len, labels))
+        lines.append("events")
+        lines += [f"  {n:<{width}}  {e.words()}" for n, e in zip(labels, work.scenario.events, strict=True)]
     return "\n".join(lines)
 
 

@@ -160,6 +160,7 @@ def simulate(work: Run) -> None:
     detail = f"{span.stop - span.start:g} s in steps of {span.step:g} s"
     if work.unchanged("simulate", key, detail):
         return
+    from exlinn_fmi.components.events import MONITOR, with_events
     from exlinn_fmi.results.metrics import control_metrics
 
     began = time.perf_counter()
@@ -167,6 +168,9 @@ def simulate(work: Run) -> None:
     for name, component in components.items():
         for warning in component.warnings:
             work.warn(f"{name}: {warning}")
+    if scenario.events:
+        components = with_events(components, scenario.events, scenario.seed, span.step)
+        span = span.model_copy(update={"record": [*span.record, f"{MONITOR}.*"]})
     starts = {name: spec.start for name, spec in scenario.components.items()}
     result = cosimulate(work, components, scenario.connection_list(), span, starts)
     written = write_table(work.folder / "trajectories", result.frame, result.units)

@@ -27,6 +27,11 @@ STILL = 1e-3
 """A line that moves by less than this share of its size is shown as one that hardly moves."""
 COINCIDE = 0.1
 """Two lines that are mostly closer than this share of their range get a strip that shows their difference."""
+EVENTS = "events."
+"""What the columns begin with that tell which events were active."""
+MOST_EVENTS = 8
+"""Events that a note names."""
+
 TRANSIENT = 5.0
 """An error that grows to this multiple of what it mostly stays within is cut off in its strip."""
 
@@ -40,9 +45,10 @@ def charts(run: RunFiles) -> list[Chart]:
         made.append(training_chart(run.training))
     if run.trajectories is not None:
         loops = control_loops(run.scenario)
-        made += [control_chart(run.trajectories, loop, several=len(loops) > 1) for loop in loops]
+        drawn = [control_chart(run.trajectories, loop, several=len(loops) > 1) for loop in loops]
         if not loops:
-            made.append(trajectory_chart(run.trajectories, run.scenario.connection_list()))
+            drawn = [trajectory_chart(run.trajectories, run.scenario.connection_list())]
+        made += [_with_events(chart, run.trajectories) for chart in drawn if chart is not None]
     return [replace(c, panels=tuple(map(_legible, c.panels))) for c in made if c is not None]
 
 
@@ -131,7 +137,12 @@ def trajectory_chart(trajectories: Table, connections: Sequence[tuple[str, str]]
     same = {target for source, target in connections if source in frame.columns}
     groups: dict[str, list[str]] = {}
     for column in map(str, frame.columns):
-        if column != "time" and column not in same and frame[column].dtype.kind in "bif":
+        if (
+            column != "time"
+            and not column.startswith(EVENTS)
+            and column not in same
+            and frame[column].dtype.kind in "bif"
+        ):
             groups.setdefault(trajectories.unit(column), []).append(column)
     blocks = [
         (unit, columns[k : k + MOST_LINES])
@@ -295,6 +306,23 @@ def _legible(panel: Panel) -> Panel:
 
 
 # ── words and numbers ────────────────────────────────────────────────────────────────────────────────────
+
+
+def _with_events(chart: Chart, trajectories: Table) -> Chart:
+    """A chart with the time shaded during which events were active, and a note of which these are."""
+    time, spans = _values(trajectories.frame, "time"), []
+    for column in map(str, trajectories.frame.columns):
+        if column.startswith(EVENTS):
+            active = _values(trajectories.frame, column) > 0.5
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], active, [False]])))
+            for first, end in edges.reshape(-1, 2).tolist():
+                spans.append(
+                    (column.removeprefix(EVENTS), float(time[first]), float(time[min(end, len(time) - 1)]))
+                )
+    told = "; ".join(f"{name} {begin:.4g}–{end:.4g} s" for name, begin, end in spans[:MOST_EVENTS])
+    more = f"; {len(spans) - MOST_EVENTS} more" if len(spans) > MOST_EVENTS else ""
+    note = _join(chart.note, f"Shaded: {told}{more}." if spans else "")
+    return replace(chart, spans=tuple(spans), note=note)
 
 
 def _values(frame: pd.DataFrame, column: str) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 
 from exlinn_fmi.data.files import write_bytes
 from exlinn_fmi.results.charts import charts
-from exlinn_fmi.results.panels import COLOURS, Chart, Line, Panel, Role, decimate
+from exlinn_fmi.results.panels import COLOURS, SHADE, Chart, Line, Panel, Role, decimate
 from exlinn_fmi.results.tables import read_run
 from exlinn_fmi.results.typography import shortened
 
@@ -123,6 +123,8 @@ def _figure(chart: Chart, title: str) -> Figure:
         box = (left / WIDTH, low / height, width / WIDTH, (high - low) / height)
         axes = figure.add_axes(box, sharex=shared)
         shared = shared or axes
+        for _, begin, end in chart.spans:
+            axes.axvspan(begin, end, color=SHADE, linewidth=0)
         return axes
 
     upper = height - top

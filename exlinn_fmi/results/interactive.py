@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from exlinn_fmi.results.panels import COLOURS, Chart, Line, Panel, Role, decimate
+from exlinn_fmi.results.panels import COLOURS, SHADE, Chart, Line, Panel, Role, decimate
 from exlinn_fmi.results.typography import shortened
 
 POINTS_A_LINE, POINTS_A_CHART = 5000, 60_000
@@ -66,7 +66,7 @@ class _Drawing:
     """Traces, axes and labels as they are put together, panel by panel."""
 
     def __init__(self, most: int, chart: Chart) -> None:
-        self.most, self.x_label, self.span = most, chart.x_label, chart.span
+        self.most, self.x_label, self.span, self.spans = most, chart.x_label, chart.span, chart.spans
         self.data: list[dict[str, Any]] = []
         legend: dict[str, Any] = {
             "x": 0,
@@ -76,6 +76,8 @@ class _Drawing:
             "bgcolor": "rgba(0,0,0,0)",
         }
         self.layout: dict[str, Any] = {"annotations": [], "legend": legend}
+        if chart.spans:
+            self.layout["shapes"] = []
         self.axes = 0
         self.named: set[str] = set()
 
@@ -113,6 +115,10 @@ class _Drawing:
             horizontal["matches"] = "x"
         if lowest:
             horizontal["title"] = {"text": escape(self.x_label), "standoff": 8}
+        for name, begin, end in self.spans:
+            place = {"xref": f"x{n}", "x0": begin, "x1": end, "yref": f"y{n} domain", "y0": 0, "y1": 1}
+            look = {"type": "rect", "layer": "below", "fillcolor": SHADE, "line": {"width": 0}}
+            self.layout["shapes"].append(place | look | {"name": escape(name)})
         self.layout[f"xaxis{n}"] = common | horizontal
         self.layout[f"yaxis{n}"] = common | {"domain": list(y), "anchor": f"x{n}"} | vertical
 

@@ -21,6 +21,8 @@ COLOURS: dict[Role, str] = {
     "error": "#009E73",
 }
 """Okabe and Ito's palette, which people with any colour vision can tell apart."""
+SHADE = "#fbe3c8"
+"""Colour of the time during which events are active."""
 OTHERS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 
 
@@ -97,6 +99,7 @@ class Chart:
         panels: in reading order.
         x_label: label of the abscissa.
         note: what the reader should know besides.
+        spans: name, begin and end of what is shaded in all panels.
     """
 
     name: str
@@ -104,6 +107,7 @@ class Chart:
     panels: tuple[Panel, ...]
     x_label: str = "time [s]"
     note: str = ""
+    spans: tuple[tuple[str, float, float], ...] = ()
 
     @property
     def span(self) -> tuple[float, float]:

@@ -34,6 +34,7 @@ Finding = tuple[KeyPath, str]
 PATTERNS = {
     r"^[A-Za-z_][A-Za-z0-9_]*$": "a name of letters, digits and _ that begins with no digit",
     r"^[A-Za-z_][A-Za-z0-9_]*\..+$": "a variable as component.variable",
+    r"^[A-Za-z_][A-Za-z0-9_]*(\..+)?$": "a component, or a variable as component.variable",
     r"^[\w.]+:\w+$": "a class as module:Class",
     r"^[A-Za-z0-9_.-]+$": "a name of letters, digits, _, . and -",
 }
@@ -164,7 +165,8 @@ def _explain(error: ErrorDetails, place: Place) -> Finding | None:
         sign, key = _BOUNDS[kind]
         return place.path, f"expected {sign} {context[key]:g}, found {found(value)}"
     if kind == "literal_error":
-        return place.path, _no_choice(value, _literals(place.annotation))
+        choices = _literals(place.annotation)
+        return place.path, _no_choice(value, choices) if choices else f"expected true, found {found(value)}"
     if kind in ("too_short", "too_long"):
         return place.path, _wrong_length(context, value)
     if kind.startswith("model_"):

@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from exlinn_fmi.errors import Problem, ScenarioError
-from exlinn_fmi.scenario import check_data, check_design, check_graph, check_learn
+from exlinn_fmi.scenario import check_data, check_design, check_events, check_graph, check_learn
 from exlinn_fmi.scenario.document import Document, parse
 from exlinn_fmi.scenario.editor import json_schema
 from exlinn_fmi.scenario.explain import Finding, schema_findings
@@ -37,6 +37,7 @@ CHECKS = (
     check_graph.start_values,
     check_graph.steps,
     check_graph.recorded,
+    check_events.events,
     check_learn.signals,
     check_learn.learning,
     check_learn.control,

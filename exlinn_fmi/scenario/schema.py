@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Discriminator, Field, Tag
 
 from exlinn_fmi.scenario.control import Nmpc
+from exlinn_fmi.scenario.events import Event
 from exlinn_fmi.scenario.learning import AnyLearn
 from exlinn_fmi.scenario.signals import Signal
 from exlinn_fmi.scenario.spec import (
@@ -175,6 +176,9 @@ class Scenario(Spec):
     )
     connections: dict[VariablePath, Paths] = Field(
         default_factory=dict, description="from: to, or from: [to, to], each component.variable"
+    )
+    events: list[Event] = Field(
+        default_factory=list, description="what happens to signals, parameters and components during a run"
     )
     trust: list[str] = Field(
         default_factory=list,
