@@ -7,10 +7,12 @@ circle, both clean and at 1 kHz. Tests: multisines that training never sees, for
 outside the range of the training data (backwards, at twice the amplitude). Errors of free runs are those of
 the worst velocity, relative to its standard deviation. Times are CPU seconds of one thread.
 
+Figures under noise are those of benchmarks/noise.py; those of other plants are of what their scenarios learn.
+
 Prints the figures beside what they must be, and the table of all learners; writes learning.json, learning.png
 and learning.svg to FOLDER. `--only` takes beginnings of names, e.g. `clean.`, `ours` or `peers.mlp`.
 `--quick` looks whether all is well: one seed, hardly any training of the peers and of the four neurons, and
-nothing that takes long (100 s of free run, accelerations missing, a million samples).
+nothing that takes long (100 s of free run, accelerations missing, a million samples, other plants).
 """
 
 from __future__ import annotations
@@ -20,22 +22,23 @@ import math
 import multiprocessing
 import resource
 import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
 
+import noise
 import numpy as np
 import pandas as pd
 from baselines.bench import METHOD, TERMS, Bench, Row, multisine, peers, trained
+from baselines.figure import Figure, print_figures
 from baselines.record import record
-from baselines.show import draw, print_table, text
+from baselines.show import draw, print_table
 from rich.console import Console
-from rich.table import Table
 from threadpoolctl import threadpool_limits
 
+from exlinn_fmi import pipeline
 from exlinn_fmi.data.dataset import Dataset, Samples, required_columns
 from exlinn_fmi.data.files import write_json
 from exlinn_fmi.learn.assembly import inverse_assembly
@@ -46,6 +49,7 @@ from exlinn_fmi.learn.structured import structured_spec
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.plants.dc_motor_cart import COORDINATES, PLANT
 from exlinn_fmi.scenario.learning import Identify
+from exlinn_fmi.workspace import Run, metrics
 
 PARAMETERS = Identify(
     lagrangian={
@@ -56,31 +60,10 @@ PARAMETERS = Identify(
     },
     dissipation={"b_m": "0.5*alpha_dot^2", "r": "0.5*i^2"},
 )
+ROOT = Path(__file__).parents[1]
 TRUTH = {p.name: p.value for p in PLANT.parameters}
 
 # ── figures ──────────────────────────────────────────────────────────────────────────────────────────────
-
-
-class Figure(NamedTuple):
-    """A number that is promised: how it is measured, what it must be and what would be better."""
-
-    measure: Callable[[Bench], float]
-    must: float
-    stretch: float
-    at_least: bool
-    slow: bool
-
-    def met(self, value: float) -> str:
-        """In a word."""
-        sign = -1 if self.at_least else 1
-        return next(
-            (
-                word
-                for word, limit in (("better", self.stretch), ("met", self.must))
-                if sign * value <= sign * limit
-            ),
-            "MISSED",
-        )
 
 
 FIGURES: dict[str, Figure] = {}
@@ -190,6 +173,27 @@ def gradient_ratio(bench: Bench) -> float:
     return median(a / b for a, b in pairs)
 
 
+def _other_plant(name: str) -> Callable[[Bench], float]:
+    """Free run over 10 s of what the plant's scenario learns, the median over seeds."""
+
+    def measure(bench: Bench) -> float:
+        found = []
+        with TemporaryDirectory() as folder:  # where the data are collected once
+            for seed in bench.seeds:
+                work = Run.open(ROOT / "scenarios" / f"{name}.yaml", Path(folder), [f"learn.seed={seed}"])
+                pipeline.train(work)
+                found.append(metrics(work.folder)["learn.rollout_nrmse_10s"])
+        return median(math.inf if value is None else value for value in found)
+
+    return measure
+
+
+for plant in ("maglev", "mems", "motor_pendulum", "two_link_arm"):
+    FIGURES[f"{plant}.rollout_nrmse_10s"] = Figure(_other_plant(plant), 1e-4, 1e-8, slow=True)
+for name, entry in noise.FIGURES.items():
+    FIGURES[name] = entry._replace(measure=partial(lambda ask, bench: ask(bench.quick), entry.measure))
+
+
 def _force_mse(bench: Bench, system: LagrangianSystem) -> float:
     return float(np.mean(force_error(system, bench.tests["10s"]) ** 2))
 
@@ -231,17 +235,6 @@ def _train_on_file(path: Path) -> tuple[float, float]:
 # ── the command ──────────────────────────────────────────────────────────────────────────────────────────
 
 
-def print_figures(found: Mapping[str, float], console: Console) -> None:
-    """Each number beside what it must be."""
-    table = Table("figure", "measured", "must", "stretch", "")
-    for name, value in found.items():
-        wanted = FIGURES[name]
-        sign = "≥ " if wanted.at_least else "≤ "
-        stretch = "" if math.isnan(wanted.stretch) else text(wanted.stretch)
-        table.add_row(name, f"{value:.3g}", sign + text(wanted.must), stretch, wanted.met(value))
-    console.print(table)
-
-
 def measure(bench: Bench, only: Sequence[str], console: Console) -> tuple[dict[str, float], list[Row]]:
     """The figures and the rows of the table that are asked for."""
 
@@ -278,7 +271,7 @@ def main() -> None:
         numbers |= {f"{row.key}.{name}": value for name, value in row.numbers.items()}
     paper = Console(width=max(Console().width, 110))
     if found:
-        print_figures(found, paper)
+        print_figures(found, FIGURES, paper)
     if rows:
         print_table(rows, paper)
         draw(rows, options.out)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 from baselines.bench import multisine
+from baselines.figure import Figure, print_figures
 from baselines.record import record
 from rich.console import Console
 from threadpoolctl import threadpool_limits
@@ -45,7 +45,9 @@ FAMILY = MonomialBasis(
 TRUE = np.array([0.1, 0.04, 1.0, 1.0, 0.5, 5.0])
 LEVELS = (0.001, 0.01, 0.05)
 SETS = 50
-"""Data sets of 1 % noise for the deviation of parameters and the coverage of their intervals."""
+"""Data sets of 1 % noise for the deviation of parameters, …"""
+COVERED = 200
+"""… and for the coverage of their intervals."""
 DISCOVERIES = 12
 """Data sets of each level of noise for the discovery of terms."""
 
@@ -71,30 +73,23 @@ def noisy(level: float, seed: int) -> Dataset:
     return Dataset(frame, clean().coordinates)
 
 
-class Estimates(NamedTuple):
-    """Parameters and their stated standard deviations, one row for each data set, and the bound."""
-
-    p: np.ndarray
-    std: np.ndarray
-    bound: np.ndarray
-
-
 @lru_cache(None)
-def estimates(level: float, sets: int) -> Estimates:
-    """Maximum likelihood from the weak form's start, on data sets that differ by their noise alone."""
+def bound(level: float) -> np.ndarray:
+    """Cramér–Rao's bound on the standard deviations of the parameters."""
     family = FAMILY.system()
     exact = cut(clean(), STATES, family.input_names)
     sigma = level * clean().frame[STATES].std().to_numpy()
     shooting = Shooting(family, replace(exact, sigma=sigma))
-    bound = np.sqrt(np.diag(shooting.information(shooting.start(TRUE)).covariance))
-    p, std = [], []
-    for seed in range(sets):
-        data = noisy(level, 1000 + 2 * seed)
-        start = weak_regression(FAMILY, data).solve()
-        fit = maximum_likelihood(family, cut(data, STATES, family.input_names), start)
-        p.append(fit.p)
-        std.append(np.sqrt(np.diag(fit.information.covariance)))
-    return Estimates(np.array(p), np.array(std), bound)
+    return np.sqrt(np.diag(shooting.information(shooting.start(TRUE)).covariance))
+
+
+@lru_cache(None)
+def estimate(level: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters and their stated deviations, by maximum likelihood from the weak form's start."""
+    family, data = FAMILY.system(), noisy(level, 1000 + 2 * seed)
+    start = weak_regression(FAMILY, data).solve()
+    fit = maximum_likelihood(family, cut(data, STATES, family.input_names), start)
+    return fit.p, np.sqrt(np.diag(fit.information.covariance))
 
 
 class Found(NamedTuple):
@@ -125,14 +120,14 @@ def discovery(level: float, seed: int) -> Found:
 
 def param_std_over_crlb(quick: bool) -> float:
     """Worst parameter: standard deviation over 50 data sets, relative to the Cramér–Rao bound."""
-    found = estimates(0.01, 5 if quick else SETS)
-    return float((found.p.std(axis=0, ddof=1) / found.bound).max())
+    p = np.array([estimate(0.01, seed)[0] for seed in range(5 if quick else SETS)])
+    return float((p.std(axis=0, ddof=1) / bound(0.01)).max())
 
 
 def coverage(quick: bool) -> float:
     """Share of the 95 % intervals of all parameters that hold the truth."""
-    found = estimates(0.01, 5 if quick else SETS)
-    return float((np.abs(found.p - TRUE) < 1.96 * found.std).mean())
+    found = [estimate(0.01, seed) for seed in range(5 if quick else COVERED)]
+    return float(np.mean([np.abs(p - TRUE) < 1.96 * std for p, std in found]))
 
 
 def rollout(level: float, quick: bool) -> float:
@@ -147,21 +142,12 @@ def exact_fraction(quick: bool) -> float:
     )
 
 
-class NoiseFigure(NamedTuple):
-    """How a figure is measured, what it must be and what would be better."""
-
-    measure: Callable[[bool], float]
-    must: float
-    stretch: float
-    at_least: bool = False
-
-
 FIGURES = {
-    "noise1.param_std_over_crlb": NoiseFigure(param_std_over_crlb, 1.3, 1.1),
-    "noise1.rollout_nrmse_10s": NoiseFigure(lambda quick: rollout(0.01, quick), 1e-3, 3e-4),
-    "noise5.rollout_nrmse_10s": NoiseFigure(lambda quick: rollout(0.05, quick), 5e-3, 1.5e-3),
-    "discovery.exact_fraction": NoiseFigure(exact_fraction, 0.9, 1.0, at_least=True),
-    "coverage.fraction": NoiseFigure(coverage, 0.9, 0.95, at_least=True),
+    "noise1.param_std_over_crlb": Figure(param_std_over_crlb, 1.3, 1.1),
+    "noise1.rollout_nrmse_10s": Figure(lambda quick: rollout(0.01, quick), 1e-3, 3e-4),
+    "noise5.rollout_nrmse_10s": Figure(lambda quick: rollout(0.05, quick), 5e-3, 1.5e-3),
+    "discovery.exact_fraction": Figure(exact_fraction, 0.9, 1.0, at_least=True),
+    "coverage.fraction": Figure(coverage, 0.9, at_least=True, most=0.99),
 }
 
 
@@ -172,13 +158,13 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="few data sets")
     parser.add_argument("--only", nargs="+", default=[""], metavar="NAME", help="beginnings of names")
     options = parser.parse_args()
-    console, numbers = Console(), {}
+    console, numbers = Console(stderr=True), {}
     with threadpool_limits(1):
         for name, figure in FIGURES.items():
             if name.startswith(tuple(options.only)):
                 numbers[name] = figure.measure(options.quick)
-                sign = "≥" if figure.at_least else "≤"
-                console.print(f"{name:<28} {numbers[name]:.4g}  (must {sign} {figure.must:g})")
+                console.log(f"{name} = {numbers[name]:.4g}")
+    print_figures(numbers, FIGURES, Console())
     if options.json:
         write_json(options.json, numbers)
 

@@ -218,8 +218,8 @@ def eliminate(
 ) -> Iterator[Discovery]:
     """Prune and refit, until every term is worth its price; yields after each fit.
 
-    Shapes are held where they start until the first pruning is done: of a term that goes nothing is to be
-    found.
+    Shapes are held where they start until pruning has come to an end, and are found then: most terms that
+    hold one are not needed, and nothing is to be found of those.
 
     Args:
         basis: the generic family.
@@ -238,10 +238,11 @@ def eliminate(
         stays = prune(last, samples, basis.size, part, held[kept])
         negative = negative_friction(part, last.p, data) & np.isnan(held[kept][: part.size])
         stays &= ~negative
-        now_free = np.isnan(known[basis.kept(chosen)]) & ~np.isnan(held[kept])
-        if stays.all() and not now_free.any():
-            break
-        chosen, held = chosen.copy(), known
+        if stays.all():
+            if not (np.isnan(known[kept]) & ~np.isnan(held[kept])).any():
+                break
+            held = known
+        chosen = chosen.copy()
         chosen[np.flatnonzero(chosen)[~stays]] = False
         last = last._replace(p=last.p[part.kept(stays)])
         last = fit(basis.only(chosen), held[basis.kept(chosen)], last)
