@@ -46,7 +46,7 @@ class Compiled(Stepper):
         self._start, self._step, self.chunk = start, step, SHORTEST
         self._program = Program(plan, recorder.every, start, step)
         self._calls = [act.call or _nothing for act in self._program.acts]
-        self._columns = np.asarray(plan.columns, dtype=np.int64)
+        self._columns = np.asarray(plan.columns, dtype=np.uint64)
         self._span = np.array([start, step])
         self.seconds: Values = np.zeros(len(plan.components))
         self._state = np.zeros(kernel.STATES, dtype=np.int64)

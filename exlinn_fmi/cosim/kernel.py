@@ -185,6 +185,10 @@ def _store(kind: int, value: float, at: int) -> bool:  # pragma: no cover - comp
 _load, _store = _compile(_load), _compile(_store)
 
 
+EXPONENT, ONE = 0x7FF0000000000000, 0x0010000000000000
+"""Bits of a float64 that are all set where it is not finite, and the lowest of them."""
+
+
 def _move(moves: Any, first: int, last: int) -> bool:  # pragma: no cover - compiled
     """Carry values from cell to cell; False at the first that its type cannot hold."""
     for m in range(first, last):
@@ -199,12 +203,11 @@ def _move(moves: Any, first: int, last: int) -> bool:  # pragma: no cover - comp
 
 
 def _finite(first: int, count: int) -> bool:  # pragma: no cover - compiled
-    """Whether all values from an address on are finite."""
+    """Whether all values from an address on are finite, by their bits: that takes a fraction of the time."""
+    bits, found = carray(_pointer(first), count, np.int64), 0
     for m in range(count):
-        value = _get_f8(first + 8 * m)
-        if value - value != 0.0:
-            return False
-    return True
+        found |= (bits[m] & EXPONENT) + ONE  # carries into the sign where all bits of the exponent are set
+    return found >= 0
 
 
 _move, _finite = _compile(_move), _compile(_finite)
@@ -251,7 +254,8 @@ def _run(
     while tick < until or at > 0:
         while at < acts:
             code = program[at, CODE]
-            if (program[at, EVERY] != 1 and tick % program[at, EVERY]) or tick + program[at, SPAN] > final:
+            every = program[at, EVERY]
+            if every != 1 and (tick % every or tick + program[at, SPAN] > final):
                 at += 1
                 continue
             if code == SET:
@@ -360,7 +364,7 @@ def _entry(context: int) -> int:  # pragma: no cover - compiled
     return _loop(  # type: ignore[no-any-return]
         carray(_pointer(where[PROGRAM]), (where[ACTS], WIDTH), np.int64),
         carray(_pointer(where[MOVES]), (where[ACTS], 3), np.int64),
-        carray(_pointer(where[COLUMNS]), where[ACROSS], np.int64),
+        carray(_pointer(where[COLUMNS]), where[ACROSS], np.uint64),
         carray(_pointer(where[SIGNALS]), where[ACROSS], np.float64),
         carray(_pointer(where[ROWS]), (where[ACTS], where[ACROSS]), np.float64),
         carray(_pointer(where[OWN_STEPS]), where[ACTS], np.float64),
