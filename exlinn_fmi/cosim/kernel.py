@@ -185,8 +185,8 @@ def _store(kind: int, value: float, at: int) -> bool:  # pragma: no cover - comp
 _load, _store = _compile(_load), _compile(_store)
 
 
-EXPONENT, ONE = 0x7FF0000000000000, 0x0010000000000000
-"""Bits of a float64 that are all set where it is not finite, and the lowest of them."""
+EXPONENT = 0x7FF0000000000000
+"""Bits of a float64 that are all set where it is not finite."""
 
 
 def _move(moves: Any, first: int, last: int) -> bool:  # pragma: no cover - compiled
@@ -206,7 +206,7 @@ def _finite(first: int, count: int) -> bool:  # pragma: no cover - compiled
     """Whether all values from an address on are finite, by their bits: that takes a fraction of the time."""
     bits, found = carray(_pointer(first), count, np.int64), 0
     for m in range(count):
-        found |= (bits[m] & EXPONENT) + ONE  # carries into the sign where all bits of the exponent are set
+        found |= (bits[m] & EXPONENT ^ EXPONENT) - 1  # negative only where all bits of the exponent are set
     return found >= 0
 
 

@@ -198,3 +198,12 @@ def test_compiled_stepping_is_chosen_where_it_pays(probes: dict[int, Path]):
 def test_without_functions_to_call_stepping_is_plain():
     graph = Graph({"i": Integrator("i")}, [])
     assert Master(graph, 0.0, 1.0, 0.1, compiled=True).run().statistics["stepping"] == "plain"
+
+
+@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=9))
+def test_values_are_found_finite_by_their_bits(values: list[float]):
+    from exlinn_fmi.cosim import kernel
+
+    array = np.array(values + [-np.nan] * (len(values) == 8), dtype=float)
+    found = kernel._finite(array.ctypes.data, len(array))
+    assert found == np.isfinite(array).all()
