@@ -8,6 +8,7 @@
     │   └─ ModelError        a learned-model folder or model structure that cannot be used
     └─ RunError              exit 2: the run failed although the input was well formed
         ├─ ComponentError    a component reported an error or returned a value that is not finite
+        ├─ LoopError         an algebraic loop between components could not be solved
         ├─ TrainingError     no usable model came out of training
         ├─ SolverError       an optimal control problem could not be set up or solved at all
         ├─ StorageError      a result could not be written
@@ -100,6 +101,10 @@ class ComponentError(RunError):
         where = f"{component}.{variable}" if variable else component
         when = f" at t = {time:.9g} s" if time is not None else ""
         super().__init__(f"{where}{when}: {message}")
+
+
+class LoopError(RunError):
+    """An algebraic loop between components could not be solved."""
 
 
 class TrainingError(RunError):

@@ -133,6 +133,38 @@ class Component(ABC):
         """Go back to a state that `save_state` returned."""
         raise NotImplementedError(f"{self.name} cannot restore its state; ask can_save_state first")
 
+    def serialize_state(self) -> bytes:
+        """The whole state as bytes that another process can go on from.
+
+        Raises:
+            NotImplementedError: it cannot; the text says why.
+        """
+        raise NotImplementedError("it cannot write its state as bytes")
+
+    def deserialize_state(self, data: bytes) -> None:
+        """Go on from a state that `serialize_state` gave, in a component that is initialised alike."""
+        raise NotImplementedError("it cannot read its state from bytes")
+
+    @property
+    def gives_derivatives(self) -> bool:
+        """Whether `directional_derivative` works."""
+        return False
+
+    def directional_derivative(
+        self, outputs: Indices, inputs: Indices, seed: Values, derivative: Values
+    ) -> Status:
+        """Write the derivative of `outputs` (k,) along `seed` (n,), a change of `inputs`, to `derivative`."""
+        raise NotImplementedError(f"{self.name} gives no derivatives; ask gives_derivatives first")
+
+    @property
+    def input_derivatives(self) -> int:
+        """Highest order of time derivatives of inputs that `set_input_derivatives` takes, 0 where none."""
+        return 0
+
+    def set_input_derivatives(self, indices: Indices, order: int, values: Values) -> Status:
+        """Set time derivatives of inputs [unit/s^order] that hold for the next step, after `set`."""
+        raise NotImplementedError(f"{self.name} takes no derivatives of inputs; ask input_derivatives first")
+
     def native(self) -> Native | None:
         """The C functions behind `set`, `get` and `step`, for compiled stepping; None where there are none.
 

@@ -48,6 +48,7 @@ from typing import Any
 import numpy as np
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
+from exlinn_fmi.components.packing import pack, unpack
 from exlinn_fmi.components.starts import check_starts, takes_start
 from exlinn_fmi.errors import ExlinnError, InputError, nearest
 
@@ -180,6 +181,14 @@ class PythonComponent(Component):
         assert isinstance(state, tuple)
         self.values[:], self._time, self._outdated, own = state
         self.set_state(own)
+
+    def serialize_state(self) -> bytes:
+        """What `save_state` returns, if `get_state` returns plain values (numbers, texts, arrays, lists)."""
+        return pack(self.save_state())
+
+    def deserialize_state(self, data: bytes) -> None:
+        """Go on from what `serialize_state` returned."""
+        self.restore_state(unpack(data))
 
     def close(self) -> None:
         """Nothing is held."""

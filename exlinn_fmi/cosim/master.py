@@ -26,6 +26,7 @@ import numpy as np
 
 from exlinn_fmi.components.base import Component
 from exlinn_fmi.cosim.graph import Graph
+from exlinn_fmi.cosim.loops import SOLVERS, LoopOptions
 from exlinn_fmi.cosim.plan import Plan
 from exlinn_fmi.cosim.profile import Timed
 from exlinn_fmi.cosim.recorder import TIME, Recorder, select
@@ -52,7 +53,8 @@ class Trajectories:
         error: why the run ended early, None where it did not; the rows until then are in `frame`.
         statistics: ``stepping`` (``plain`` or ``compiled``), ``steps`` (number done), ``seconds`` (wall
             time), ``real_time_factor`` (simulated over wall time), ``warnings`` (by component: ``count`` and
-            text of the ``first``) and, where asked for, ``component_seconds`` (by component).
+            text of the ``first``) and, where asked for, ``component_seconds`` (by component); ``loop_passes``
+            and ``loop_residual`` (their number, the worst accepted) where algebraic loops are solved.
     """
 
     frame: pd.DataFrame
@@ -75,6 +77,7 @@ class Master:
         profile: whether to measure the time that each component takes (costs up to 0.2 µs per call).
         compiled: whether to step in compiled code what offers its C functions; by default, where it pays.
         record_every: a row is recorded at every so many communication points.
+        loops: how algebraic loops are solved; without it each is broken by a delay of one step.
 
     Raises:
         InputError: times do not fit together, or `record` names what is not there.
@@ -92,6 +95,7 @@ class Master:
         profile: bool = False,
         compiled: bool | None = None,
         record_every: int = 1,
+        loops: LoopOptions | None = None,
     ) -> None:
         self.graph, self.start, self.stop, self.step = graph, start, stop, step
         self.ticks = count_ticks(start, stop, step)
@@ -103,9 +107,14 @@ class Master:
             raise InputError(f"algorithm: there is no {algorithm!r}; {hint}")
         self._seidel = algorithm == "gauss-seidel"
         self.recorded = select(graph.components, record)
+        if loops is not None and loops.solver not in SOLVERS:
+            raise InputError(
+                f"loops: there is no solver {loops.solver!r}; {nearest(loops.solver, SOLVERS, 'solvers')}"
+            )
         if record_every < 1:
             raise InputError(f"record_every: expected a whole number of at least 1, found {record_every}")
         self._profile, self._compiled, self._every = profile, compiled, record_every
+        self._loops = loops
         self._stepper: Stepper | None = None
 
     def run(
@@ -138,7 +147,14 @@ class Master:
             _check_names(self.graph, "start values", starts)
             recorder = self._recorder()
             plan = Plan(
-                self.graph, components, self.recorded, self.every, self.ticks, self.step, self._seidel
+                self.graph,
+                components,
+                self.recorded,
+                self.every,
+                self.ticks,
+                self.step,
+                self._seidel,
+                self._loops,
             )
             error = self._attempt(plan, recorder, starts, progress, should_stop)
         finally:
@@ -216,7 +232,9 @@ class Master:
 
     def _statistics(self, plan: Plan, recorder: Recorder, seconds: float) -> dict[str, Any]:
         steps = max(recorder.rows - 1, 0) * self._every
-        return {
+        loops = plan.loops
+        solved = {} if loops is None else {"loop_passes": loops.passes, "loop_residual": loops.worst}
+        return solved | {
             "stepping": "plain" if self._stepper is None else type(self._stepper).__name__.lower(),
             "steps": steps,
             "seconds": seconds,

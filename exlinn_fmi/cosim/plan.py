@@ -19,6 +19,7 @@ import numpy as np
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values
 from exlinn_fmi.cosim.graph import Graph
+from exlinn_fmi.cosim.loops import LoopOptions, Loops
 from exlinn_fmi.cosim.order import Port
 from exlinn_fmi.errors import ComponentError, InputError, RunError
 
@@ -88,8 +89,10 @@ class Plan:
         recorded: variables to record.
         every: own step in ticks, by component number.
         ticks: number of the last tick.
+        loops: the algebraic loops, where they are solved.
         step: step of the master [s].
         gauss_seidel: whether inputs are refreshed from components already stepped.
+        loops: how algebraic loops are solved; without it they are broken by delays.
 
     Attributes:
         signals: the time, and the value of every variable that is passed on or recorded.
@@ -98,6 +101,7 @@ class Plan:
         advances: the steps in order.
         hold_to, hold_from: places in `signals` of delayed values, and of what they are next.
         ticks: number of the last tick.
+        loops: the algebraic loops, where they are solved.
         columns: where time and recorded variables are in `signals`.
         warnings: by component name.
     """
@@ -111,6 +115,7 @@ class Plan:
         ticks: int,
         step: float,
         gauss_seidel: bool,
+        loops: LoopOptions | None = None,
     ) -> None:
         self.graph, self.components = graph, tuple(components)
         self.warnings: dict[str, Warned] = {}
@@ -121,6 +126,7 @@ class Plan:
             for v, given, taken in self._pieces
         ]
         self.advances = self._plan_advances(every, step, gauss_seidel)
+        self.loops = Loops(self, self._torn, loops) if loops is not None and self._torn else None
 
     # ── layout ───────────────────────────────────────────────────────────────────────────────────────────
 
@@ -152,6 +158,7 @@ class Plan:
         for ports in constants:
             places |= ports
         holds = {port: place for ports in held for port, place in ports.items()}
+        self._torn = list(holds)
 
         self.signals: Values = np.zeros(size)
         self.columns = _indices([0, *(places[p] for p in recorded)])
@@ -265,8 +272,18 @@ class Plan:
         for every, exchange in self.visits:
             if not k % every:
                 self.exchange(exchange, signals, t)
-        if self.hold_to.size:
-            signals[self.hold_to] = signals[self.hold_from]
+        self.pass_on(k, t)
+
+    def pass_on(self, k: int, t: float) -> None:
+        """Give delayed values on to the next tick, or solve the loops that they stand for.
+
+        Raises:
+            LoopError: a loop has no solution that was found.
+        """
+        if self.loops is not None:
+            self.loops.close(k, t)
+        elif self.hold_to.size:
+            self.signals[self.hold_to] = self.signals[self.hold_from]
 
     def advance(self, k: int, t: float) -> None:
         """Step the components due at tick k, each over its own step.
@@ -322,6 +339,11 @@ class Plan:
             raise
         except Exception as error:
             raise self.wrapped(x.component, error, t) from error
+
+    def places(self, piece: Values) -> range:
+        """Where a piece of `signals` lies in it."""
+        first = (piece.ctypes.data - self.signals.ctypes.data) // self.signals.itemsize
+        return range(first, first + len(piece))
 
     # ── failure ──────────────────────────────────────────────────────────────────────────────────────────
 

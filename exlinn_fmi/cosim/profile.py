@@ -69,6 +69,40 @@ class Timed(Component):
         self.seconds += perf_counter() - began
         return status
 
+    def serialize_state(self) -> bytes:
+        """As the inner component."""
+        return self._inner.serialize_state()
+
+    def deserialize_state(self, data: bytes) -> None:
+        """As the inner component."""
+        self._inner.deserialize_state(data)
+
+    @property
+    def gives_derivatives(self) -> bool:
+        """As the inner component."""
+        return self._inner.gives_derivatives
+
+    def directional_derivative(
+        self, outputs: Indices, inputs: Indices, seed: Values, derivative: Values
+    ) -> Status:
+        """Measured."""
+        began = perf_counter()
+        status = self._inner.directional_derivative(outputs, inputs, seed, derivative)
+        self.seconds += perf_counter() - began
+        return status
+
+    @property
+    def input_derivatives(self) -> int:
+        """As the inner component."""
+        return self._inner.input_derivatives
+
+    def set_input_derivatives(self, indices: Indices, order: int, values: Values) -> Status:
+        """Measured."""
+        began = perf_counter()
+        status = self._inner.set_input_derivatives(indices, order, values)
+        self.seconds += perf_counter() - began
+        return status
+
     def native(self) -> Native | None:
         """As the inner component; whoever calls its functions measures them."""
         return self._inner.native()

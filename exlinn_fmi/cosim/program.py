@@ -95,7 +95,9 @@ class Program:
         base = plan.signals.ctypes.data
         held = zip(plan.hold_from, plan.hold_to, strict=True)
         first = self._add_moves((k.F8, base + 8 * int(a), base + 8 * int(b)) for a, b in held)
-        if plan.hold_to.size:
+        if plan.loops is not None:
+            self._add(k.PYTHON, act=Act(call=lambda tick: plan.pass_on(tick, self._time(tick))))
+        elif plan.hold_to.size:
             self._add(k.MOVE, {k.FIRST: first, k.LAST: len(self._moves)})
         self._add(k.ROW, {k.EVERY: every})
         self.table = np.zeros((len(self._lines), k.WIDTH), dtype=np.int64)
