@@ -10,7 +10,7 @@ version of the Aitken accelerator for computer iteration", 1969.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -109,6 +109,14 @@ class Loops:
             if iteration < self._options.iterations:
                 self._around(update(x, residual), visits, t)
         self._fail(size, t, f"the residual is {size.max():.3g} after {iteration} passes")
+
+    def save(self) -> dict[str, Any]:
+        """What it remembers from one communication point to the next, in plain values."""
+        return {"inverse": self._inverse, "passes": self.passes, "worst": self.worst}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Remember what `save` gave."""
+        self._inverse, self.passes, self.worst = state["inverse"], state["passes"], state["worst"]
 
     def _around(self, x: Values, visits: Sequence[Exchange], t: float) -> None:
         """One pass with torn values x; what they become is in the signals then.

@@ -15,9 +15,6 @@ References: FMI 2.0 §4.2.1; Kübler and Schiehlen, "Two methods of simulator co
 
 from __future__ import annotations
 
-import math
-import sys
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
@@ -27,20 +24,20 @@ import numpy as np
 from exlinn_fmi.components.base import Component
 from exlinn_fmi.cosim.graph import Graph
 from exlinn_fmi.cosim.loops import SOLVERS, LoopOptions
+from exlinn_fmi.cosim.pace import Pace
 from exlinn_fmi.cosim.plan import Plan
 from exlinn_fmi.cosim.profile import Timed
 from exlinn_fmi.cosim.recorder import TIME, Recorder, select
 from exlinn_fmi.cosim.stepping import Stepper, make_stepper
+from exlinn_fmi.cosim.store import RowFile, Store
+from exlinn_fmi.cosim.times import count_every, count_ticks
+from exlinn_fmi.cosim.watch import Progress, Watch
 from exlinn_fmi.errors import InputError, Interrupted, RunError, nearest
 
 if TYPE_CHECKING:
     import pandas as pd
 
 ALGORITHMS = ("jacobi", "gauss-seidel")
-Progress = Callable[[float, float], None]
-
-REPORT_EVERY = 0.1
-"""Least wall time between two reports of progress [s]."""
 
 
 @dataclass(frozen=True)
@@ -48,19 +45,23 @@ class Trajectories:
     """What came of a run.
 
     Args:
-        frame: columns ``time`` [s] and ``component.variable``, a row per communication point.
+        frame: columns ``time`` [s] and ``component.variable``, a row per communication point; of a run in a
+            store that is too long for the memory, every n-th.
         units: unit by column, where one is known.
         error: why the run ended early, None where it did not; the rows until then are in `frame`.
         statistics: ``stepping`` (``plain`` or ``compiled``), ``steps`` (number done), ``seconds`` (wall
             time), ``real_time_factor`` (simulated over wall time), ``warnings`` (by component: ``count`` and
             text of the ``first``) and, where asked for, ``component_seconds`` (by component); ``loop_passes``
-            and ``loop_residual`` (their number, the worst accepted) where algebraic loops are solved.
+            and ``loop_residual`` (their number, the worst accepted) where algebraic loops are solved;
+            ``missed_deadlines``, ``worst_delay`` and ``first_delay_at`` [s] of a run that is paced.
+        rows: all rows, where the run has a store.
     """
 
     frame: pd.DataFrame
     units: dict[str, str]
     error: RunError | None
     statistics: dict[str, Any]
+    rows: RowFile | None = None
 
 
 class Master:
@@ -122,6 +123,8 @@ class Master:
         starts: Mapping[str, Mapping[str, float]] | None = None,
         progress: Progress | None = None,
         should_stop: Callable[[], bool] | None = None,
+        store: Store | None = None,
+        pace: float | None = None,
     ) -> Trajectories:
         """Run from start to stop and close all components, whatever happens.
 
@@ -130,22 +133,26 @@ class Master:
         Args:
             starts: start values by component and variable.
             progress: told (fraction done, t [s]) about ten times a second.
-            should_stop: asked after every row; True ends the run with the rows so far.
+            should_stop: asked after every row, or some of them where many are done in a moment; True ends the
+                run with the rows so far.
+            store: where rows and checkpoints are kept; without it rows stay in memory.
+            pace: simulated time per wall time that the run is held to; without it, as fast as it goes.
 
         Returns:
             The trajectories; a failure in the course of the run is their `error`.
 
         Raises:
-            InputError: a start value that a component does not take, or a table too large for the memory.
+            InputError: a start value that a component does not take, a table too large for the memory, or no
+                checkpoint to go on from.
         """
         starts = starts or {}
         components: list[Component] = list(self.graph.components.values())
         if self._profile:
             components = [Timed(component) for component in components]
-        began = time.perf_counter()
+        watch = Watch(progress, should_stop, store, None if pace is None else Pace(pace))
         try:
             _check_names(self.graph, "start values", starts)
-            recorder = self._recorder()
+            recorder = self._recorder(store)
             plan = Plan(
                 self.graph,
                 components,
@@ -156,12 +163,12 @@ class Master:
                 self._seidel,
                 self._loops,
             )
-            error = self._attempt(plan, recorder, starts, progress, should_stop)
+            error = self._attempt(plan, recorder, starts, watch)
         finally:
             faults = _close(components)
         for number, text in faults:
             plan.warn(number, text)
-        statistics = self._statistics(plan, recorder, time.perf_counter() - began)
+        statistics = self._statistics(plan, recorder, watch)
         if self._profile:
             timed = [c.seconds for c in components if isinstance(c, Timed)]
             inside = np.zeros(len(timed)) if self._stepper is None else self._stepper.seconds
@@ -169,139 +176,79 @@ class Master:
                 name: seconds + float(more)
                 for name, seconds, more in zip(self.graph.names, timed, inside, strict=True)
             }
-        return Trajectories(recorder.frame(), recorder.units, error, statistics)
+        frame = recorder.frame()
+        if recorder.file is not None:
+            recorder.file.close()
+        return Trajectories(frame, recorder.units, error, statistics, recorder.file)
 
-    def _recorder(self) -> Recorder:
+    def _recorder(self, store: Store | None) -> Recorder:
         """An empty table for time and recorded variables."""
         names = [TIME, *map(self.graph.path, self.recorded)]
         stated = [self.graph.variable(port).unit for port in self.recorded]
         units = {name: unit for name, unit in zip(names, ["s", *stated], strict=True) if unit is not None}
-        return Recorder(names, units, self.ticks, self._every)
+        file = None if store is None else store.row_file(len(names))
+        return Recorder(names, units, self.ticks, self._every, file)
 
     def _attempt(
-        self,
-        plan: Plan,
-        recorder: Recorder,
-        starts: Mapping[str, Mapping[str, float]],
-        progress: Progress | None,
-        should_stop: Callable[[], bool] | None,
+        self, plan: Plan, recorder: Recorder, starts: Mapping[str, Mapping[str, float]], watch: Watch
     ) -> RunError | None:
         """Step until the end or until something happens, which is returned."""
         try:
             # What is not finite becomes an error with name and time: no warnings of numpy beside it.
             with np.errstate(over="ignore", invalid="ignore"):
                 plan.initialize(self.start, self.stop, starts)
-                self._step_all(plan, recorder, progress, should_stop)
+                self._step_all(plan, recorder, watch)
         except RunError as error:
             return error
         except KeyboardInterrupt:
-            if should_stop is not None and should_stop():
+            if watch.stopping:
                 raise  # asked for the second time: at once
             return Interrupted("stopped by the user; the rows so far are kept")
         return None
 
-    def _step_all(
-        self,
-        plan: Plan,
-        recorder: Recorder,
-        progress: Progress | None,
-        should_stop: Callable[[], bool] | None,
-    ) -> None:
+    def _step_all(self, plan: Plan, recorder: Recorder, watch: Watch) -> None:
         """Step from tick to tick, a row each.
 
         Raises:
             RunError: a component failed, or the user asked to stop.
         """
-        ticks, k, report_at = self.ticks, 0, 0.0
-        plan.propagate(0, self.start)
-        recorder.record(0, plan.signals, plan.columns)
+        ticks, saved = self.ticks, watch.saved()
+        if saved is None:
+            k = 0
+            plan.propagate(0, self.start)
+            recorder.record(0, plan.signals, plan.columns)
+        else:
+            k = saved["tick"]
+            plan.restore(saved["plan"])
+            recorder.go_on(saved["rows"])
         stepper = make_stepper(plan, recorder, self.start, self.step, self._profile, self._compiled)
         self._stepper = stepper
-        while True:
-            t = self.start + k * self.step
-            if progress is not None and (time.perf_counter() >= report_at or k == ticks):
-                progress(k / ticks, t)
-                report_at = time.perf_counter() + REPORT_EVERY
-            if k == ticks:
-                return
-            if should_stop is not None and should_stop():
-                raise Interrupted(f"stopped by the user at t = {t:.9g} s; the rows so far are kept")
-            until = min(k + stepper.chunk, ticks)
+
+        def state() -> tuple[dict[str, Any], Recorder]:
+            return {"tick": k, "plan": plan.save()}, recorder
+
+        while watch.goes_on(k, ticks, self.start + k * self.step, state):
+            chunk = stepper.chunk if watch.pace is None else 1
+            until = min(k + chunk, k + recorder.room(k), ticks)
             stepper.run(k, until)
             k = until
 
-    def _statistics(self, plan: Plan, recorder: Recorder, seconds: float) -> dict[str, Any]:
+    def _statistics(self, plan: Plan, recorder: Recorder, watch: Watch) -> dict[str, Any]:
         steps = max(recorder.rows - 1, 0) * self._every
         loops = plan.loops
         solved = {} if loops is None else {"loop_passes": loops.passes, "loop_residual": loops.worst}
-        return solved | {
-            "stepping": "plain" if self._stepper is None else type(self._stepper).__name__.lower(),
-            "steps": steps,
-            "seconds": seconds,
-            "real_time_factor": steps * self.step / seconds,
-            "warnings": {name: asdict(warned) for name, warned in plan.warnings.items()},
-        }
-
-
-# ── times ────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def count_ticks(start: float, stop: float, step: float) -> int:
-    """Number of steps from start to stop.
-
-    Args:
-        start: [s].
-        stop: [s].
-        step: [s].
-
-    Raises:
-        InputError: it is no whole number of at least 1; the nearest stop times are offered.
-    """
-    if not (math.isfinite(start) and math.isfinite(stop) and math.isfinite(step) and step > 0):
-        raise InputError(
-            f"start {start} s, stop {stop} s, step {step} s: expected finite times and a step above 0"
+        seconds = watch.seconds
+        return (
+            solved
+            | watch.report()
+            | {
+                "stepping": "plain" if self._stepper is None else type(self._stepper).__name__.lower(),
+                "steps": steps,
+                "seconds": seconds,
+                "real_time_factor": steps * self.step / seconds,
+                "warnings": {name: asdict(warned) for name, warned in plan.warnings.items()},
+            }
         )
-    if stop <= start:
-        raise InputError(f"stop {stop:.12g} s does not lie after start {start:.12g} s; give a later stop")
-    ratio = (stop - start) / step
-    ticks = round(ratio)
-    if ticks >= 1 and _whole(ratio, max(abs(start), abs(stop)) / step):
-        return ticks
-    below, above = (f"{start + n * step:.12g} s" for n in (math.floor(ratio), math.floor(ratio) + 1))
-    offer = f"{below} or {above}" if ratio > 1 else above
-    raise InputError(
-        f"stop {stop:.12g} s is no whole number of steps of {step:.12g} s after start {start:.12g} s; "
-        f"nearest: {offer}"
-    )
-
-
-def count_every(name: str, own_step: float, step: float) -> int:
-    """A component's own step in steps of the master.
-
-    Args:
-        name: of the component, for the message.
-        own_step: [s].
-        step: [s].
-
-    Raises:
-        InputError: it is no whole number of at least 1; the nearest own steps are offered.
-    """
-    if not (math.isfinite(own_step) and own_step > 0):
-        raise InputError(f"component {name!r}: its step is {own_step} s, expected a finite time above 0")
-    ratio = own_step / step
-    if ratio > 0.5 and _whole(ratio, ratio):
-        return round(ratio)
-    below, above = (f"{n * step:.12g} s" for n in (math.floor(ratio), math.floor(ratio) + 1))
-    offer = f"{below} or {above}" if ratio > 1 else f"{step:.12g} s"
-    raise InputError(
-        f"component {name!r}: its step {own_step:.12g} s is no multiple of the communication step "
-        f"{step:.12g} s; nearest: {offer}"
-    )
-
-
-def _whole(ratio: float, largest: float) -> bool:
-    """Whether a ratio of times is whole, but for the rounding of times as large as `largest` steps."""
-    return abs(ratio - round(ratio)) <= max(1e-9, 4 * sys.float_info.epsilon * largest)
 
 
 # ── checks and closing ───────────────────────────────────────────────────────────────────────────────────

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -344,6 +345,40 @@ class Plan:
         """Where a piece of `signals` lies in it."""
         first = (piece.ctypes.data - self.signals.ctypes.data) // self.signals.itemsize
         return range(first, first + len(piece))
+
+    # ── checkpoints ──────────────────────────────────────────────────────────────────────────────────────
+
+    def save(self) -> dict[str, Any]:
+        """All that is needed to go on from here, in plain values.
+
+        Raises:
+            NotImplementedError: a component cannot write its state; the text names all that cannot.
+        """
+        states, problems = {}, []
+        for name, component in zip(self.graph.names, self.components, strict=True):
+            try:
+                states[name] = component.serialize_state()
+            except NotImplementedError as error:
+                problems.append(f"{name}: {error}")
+        if problems:
+            raise NotImplementedError("; ".join(problems))
+        warnings = {name: [warned.count, warned.first] for name, warned in self.warnings.items()}
+        return {
+            "components": states,
+            "signals": self.signals,
+            "ahead": self.ahead,
+            "warnings": warnings,
+            "loops": None if self.loops is None else self.loops.save(),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `save` gave, in components that are initialised alike."""
+        for name, component in zip(self.graph.names, self.components, strict=True):
+            component.deserialize_state(state["components"][name])
+        self.signals[:], self.ahead[:] = state["signals"], state["ahead"]
+        self.warnings = {name: Warned(*warned) for name, warned in state["warnings"].items()}
+        if self.loops is not None:
+            self.loops.restore(state["loops"])
 
     # ── failure ──────────────────────────────────────────────────────────────────────────────────────────
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.components.base import Component, Indices, Values
 from exlinn_fmi.cosim.order import Port
+from exlinn_fmi.cosim.store import RowFile
 from exlinn_fmi.errors import InputError, nearest
 
 if TYPE_CHECKING:
@@ -66,45 +67,78 @@ def _expression(pattern: str) -> str:
 
 
 class Recorder:
-    """A table with a row for every so many communication points, allocated before the run begins.
+    """A row for every so many communication points: all in memory, or a block there and the others in a file.
 
     Args:
         names: names of the columns, the first is the time.
         units: units by name.
         ticks: number of the last communication point.
         every: a row is recorded at each tick that is a multiple of it.
+        file: where rows go; without it they stay in memory.
 
     Attributes:
         table: (rows, columns), filled from the top by whoever steps.
-        rows: how many are filled.
+        rows: how many rows are recorded in all.
         base: number of the row that the table begins with.
 
     Raises:
         InputError: so many rows do not fit into memory.
     """
 
-    def __init__(self, names: Sequence[str], units: Mapping[str, str], ticks: int, every: int = 1) -> None:
-        self.names, self.units, self.every = list(names), dict(units), every
+    def __init__(
+        self,
+        names: Sequence[str],
+        units: Mapping[str, str],
+        ticks: int,
+        every: int = 1,
+        file: RowFile | None = None,
+    ) -> None:
+        self.names, self.units, self.every, self.file = list(names), dict(units), every, file
         self.rows = self.base = 0
         rows = ticks // every + 1
         try:
-            self.table: NDArray[np.float64] = np.empty((rows, len(names)))
+            here = rows if file is None else min(rows, file.block)
+            self.table: NDArray[np.float64] = np.empty((here, len(names)))
         except (MemoryError, ValueError) as error:
             size = f"{rows} rows of {len(names)} columns ({8e-9 * rows * len(names):.3g} GB)"
             raise InputError(
-                f"{size} do not fit into memory; record fewer variables, take a longer step or stop earlier"
+                f"{size} do not fit into memory; record fewer variables, take a longer step, stop earlier or "
+                "stream them to disk"
             ) from error
 
     def record(self, tick: int, signals: Values, columns: Indices) -> None:
-        """Record the row of a tick, if it has one."""
+        """Record the row of a tick, if it has one; there is `room` for it."""
         if not tick % self.every:
             row = tick // self.every
             self.table[row - self.base] = signals[columns]
             self.rows = row + 1
 
+    def room(self, tick: int) -> int:
+        """How many ticks after this one have room in the table for their rows; makes room as needed."""
+        room = (self.base + len(self.table)) * self.every - 1 - tick
+        if room < 1 and self.file is not None:
+            self.flush()
+            return self.room(tick)
+        return room
+
+    def flush(self) -> None:
+        """Have all rows in the file, and begin a new block."""
+        assert self.file is not None
+        self.file.append(self.table[: self.rows - self.base])
+        self.base = self.rows
+
+    def go_on(self, rows: int) -> None:
+        """Begin after the first so many rows of the file."""
+        assert self.file is not None
+        self.file.cut(rows)
+        self.rows = self.base = rows
+
     def frame(self) -> pd.DataFrame:
-        """The filled rows as a frame."""
+        """The rows as a frame; of more than fit well into memory, every n-th."""
         import pandas as pd
 
+        if self.file is not None:
+            self.flush()
+            return pd.DataFrame(self.file.thinned(), columns=self.names)
         # The copy of a run that ended early does not hold the memory of the rows that it lacks.
         return pd.DataFrame(self.table[: self.rows], columns=self.names, copy=self.rows < len(self.table))

@@ -201,6 +201,7 @@ def test_without_functions_to_call_stepping_is_plain():
 
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=9))
+@settings(deadline=None)
 def test_values_are_found_finite_by_their_bits(values: list[float]):
     from exlinn_fmi.cosim import kernel
 

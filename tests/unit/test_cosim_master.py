@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exlinn_fmi.components.base import Status
-from exlinn_fmi.cosim import master as master_module
+from exlinn_fmi.cosim import watch as watch_module
 from exlinn_fmi.cosim.master import Master, Trajectories, count_every, count_ticks
 from exlinn_fmi.errors import ComponentError, InputError, Interrupted, SolverError
 
@@ -441,7 +441,7 @@ def test_stop_request_after_the_last_row_changes_nothing():
 
 def test_progress_is_told_seldom_and_at_the_end(monkeypatch: pytest.MonkeyPatch):
     clock = iter(np.arange(10**6) * 1e-3)
-    monkeypatch.setattr(master_module.time, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(watch_module.time, "perf_counter", lambda: next(clock))
     told: list[tuple[float, float]] = []
     master = Master(graph([Integrator("a")]), 0.0, 10.0, 0.01)
     master.run(progress=lambda fraction, t: told.append((fraction, t)))

@@ -1,0 +1,169 @@
+"""A run on disk: rows in a file that grows, and checkpoints that a killed run goes on from.
+
+`rows.f64` holds rows of float64 one after the other; `checkpoint.json` the whole state at one tick, how many
+rows there were then, and which run it is of. It is replaced as a whole, after the rows that it counts are on
+the disk: whenever the run is killed, the two fit together.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from exlinn_fmi.components.packing import pack, unpack
+from exlinn_fmi.errors import InputError, StorageError
+
+Rows = NDArray[np.float64]
+
+BLOCK = 2**24
+"""Bytes of rows that are in memory at a time."""
+
+FULL_FRAME = 2**29
+"""Bytes of rows from which on a run is kept on disk, and only every n-th row of it is put into a frame."""
+
+
+class RowFile:
+    """Rows of float64 in a file.
+
+    Args:
+        path: the file.
+        columns: number of columns.
+        keep: whether to go on with the rows that are there; else it begins empty.
+
+    Attributes:
+        rows: how many there are.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+
+    def __init__(self, path: Path, columns: int, keep: bool = False) -> None:
+        self.path, self.columns = path, columns
+        with _explained(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._stream = path.open("r+b" if keep else "w+b")
+        self.rows = path.stat().st_size // (8 * columns)
+
+    @property
+    def block(self) -> int:
+        """Rows that are best written and read in one go."""
+        return max(1024, BLOCK // (8 * self.columns))
+
+    def cut(self, rows: int) -> None:
+        """Forget all rows after the first so many."""
+        self._stream.truncate(8 * self.columns * rows)
+        self._stream.seek(0, os.SEEK_END)
+        self.rows = rows
+
+    def append(self, rows: Rows) -> None:
+        """Add rows.
+
+        Raises:
+            StorageError: the disk is full, …
+        """
+        with _explained(self.path):
+            self._stream.write(rows.tobytes())
+            self._stream.flush()
+        self.rows += len(rows)
+
+    def sync(self) -> None:
+        """Have all rows on the disk."""
+        with _explained(self.path):
+            os.fsync(self._stream.fileno())
+
+    def blocks(self) -> Iterator[Rows]:
+        """All rows, some at a time."""
+        with self.path.open("rb") as stream:
+            while data := stream.read(8 * self.columns * self.block):
+                yield np.frombuffer(data).reshape(-1, self.columns)
+
+    def thinned(self) -> Rows:
+        """Every n-th row, so that they fit well into memory; all of them if they do."""
+        every = -(-8 * self.columns * self.rows // FULL_FRAME) or 1
+        parts, first = [np.empty((0, self.columns))], 0
+        for block in self.blocks():
+            parts.append(block[-first % every :: every])
+            first += len(block)
+        return np.concatenate(parts)
+
+    def close(self) -> None:
+        """Close the file; what is in it stays."""
+        self._stream.close()
+
+
+class Store:
+    """Where a run keeps rows and checkpoints.
+
+    Args:
+        folder: made as needed.
+        every: wall time between two checkpoints [s]; without it there are none.
+        key: of the run; a checkpoint of another run is refused.
+        resume: whether to go on from the checkpoint there.
+    """
+
+    def __init__(self, folder: Path, every: float | None = None, key: str = "", resume: bool = False) -> None:
+        self.folder, self.every, self.key, self.resume = folder, every, key, resume
+
+    @property
+    def _file(self) -> Path:
+        return self.folder / "checkpoint.json"
+
+    def row_file(self, columns: int) -> RowFile:
+        """The file for rows."""
+        return RowFile(self.folder / "rows.f64", columns, keep=self.resume)
+
+    def save(self, state: Mapping[str, Any], rows: RowFile) -> None:
+        """Write a checkpoint.
+
+        Raises:
+            NotImplementedError: something in it cannot be written.
+            StorageError: the disk is full, …
+        """
+        data = pack({"key": self.key, "rows": rows.rows, **state})
+        rows.sync()
+        beside = self._file.with_suffix(".new")
+        with _explained(self._file):
+            with beside.open("wb") as stream:
+                stream.write(data)
+                stream.flush()
+                os.fsync(stream.fileno())
+            beside.replace(self._file)
+
+    def load(self) -> dict[str, Any]:
+        """The last checkpoint.
+
+        Raises:
+            InputError: there is none, it is damaged, or it is of another run.
+        """
+        try:
+            state: dict[str, Any] = unpack(self._file.read_bytes())
+            key = state["key"]
+        except FileNotFoundError:
+            raise InputError(
+                f"{self.folder}: there is no checkpoint to go on from; say `checkpoint: 60` in `simulate` "
+                "for one each minute, and run without --resume"
+            ) from None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{self._file}: cannot be read ({error}); run without --resume") from error
+        if key != self.key:
+            raise InputError(
+                f"{self._file}: is of a run with other settings, files or another version of exlinn; run "
+                "without --resume, or with what it was begun with"
+            )
+        return state
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Turn errors of the system into one that names the file."""
+    try:
+        yield
+    except OSError as error:
+        cause = error.strerror or error
+        raise StorageError(f"{path}: could not be written ({cause}); free some space there") from error
