@@ -37,6 +37,14 @@ Overrides = Annotated[
     typer.Option("--set", metavar="KEY.PATH=VALUE", help="Set a value of the scenario; may be given often."),
 ]
 
+Resume = Annotated[
+    bool, typer.Option("--resume", help="Go on from the last checkpoint of a co-simulation that was stopped.")
+]
+Record = Annotated[
+    list[str] | None,
+    typer.Option("--record", metavar="PATTERN", help="Record what fits, e.g. 'plant.*'; may be given often."),
+]
+
 
 class Terminal:
     """Shows progress on stderr: a bar on a terminal, plain lines of stages elsewhere."""
@@ -95,7 +103,13 @@ def perform(work: Callable[[Run], object], file: Path, out: Path | None, overrid
 
 
 @app.command()
-def run(scenario: ScenarioFile, out: Out = None, overrides: Overrides = None) -> None:
+def run(
+    scenario: ScenarioFile,
+    out: Out = None,
+    overrides: Overrides = None,
+    record: Record = None,
+    resume: Resume = False,
+) -> None:
     """Do all that a scenario asks for: collect, train, simulate, report.
 
     Example: exlinn run scenarios/dcwc_tracking.yaml --set simulate.stop=5
@@ -103,7 +117,8 @@ def run(scenario: ScenarioFile, out: Out = None, overrides: Overrides = None) ->
     from exlinn_fmi import pipeline
 
     began = time.perf_counter()
-    work = perform(pipeline.run, scenario, out, overrides)
+    overrides = [*(overrides or ()), *recording(record)]
+    work = perform(lambda work: pipeline.run(work, resume), scenario, out, overrides)
     show_metrics(work.folder)
     typer.echo(f"\n{work.folder / 'report.html'}  ({time.perf_counter() - began:.1f} s)")
 
@@ -177,14 +192,24 @@ def design(scenario: ScenarioFile, out: Out = None, overrides: Overrides = None)
 
 
 @app.command()
-def simulate(scenario: ScenarioFile, out: Out = None, overrides: Overrides = None) -> None:
+def simulate(
+    scenario: ScenarioFile,
+    out: Out = None,
+    overrides: Overrides = None,
+    record: Record = None,
+    resume: Resume = False,
+) -> None:
     """Run the scenario's components in co-simulation (learning first what they need).
 
     Example: exlinn simulate scenarios/external_fmu.yaml --set components.fmu.fmu=/path/to/Plant.fmu
+
+    A long run that may be interrupted: --set simulate.checkpoint=60 makes a checkpoint each minute, and the
+    same command with --resume goes on from the last one.
     """
     from exlinn_fmi import pipeline
 
-    work = perform(pipeline.simulate, scenario, out, overrides)
+    overrides = [*(overrides or ()), *recording(record)]
+    work = perform(lambda work: pipeline.simulate(work, resume), scenario, out, overrides)
     show_metrics(work.folder, "control.", "simulate.")
     typer.echo(f"\n{work.folder / 'trajectories.csv'}")
 
@@ -230,6 +255,13 @@ def schema(
     else:
         write_text(out, text)
         typer.echo(str(out))
+
+
+def recording(patterns: list[str] | None) -> list[str]:
+    """The setting of the scenario that stands for `--record`."""
+    import json
+
+    return [f"simulate.record={json.dumps(patterns)}"] if patterns else []
 
 
 def show_metrics(folder: Path, *prefixes: str) -> None:

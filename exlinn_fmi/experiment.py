@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from exlinn_fmi.cosim.master import Trajectories
+    from exlinn_fmi.cosim.store import Store
     from exlinn_fmi.data.dataset import Dataset
     from exlinn_fmi.scenario.learning import Experiment, LearnFromPlant
     from exlinn_fmi.scenario.schema import Simulate
@@ -28,16 +29,39 @@ def cosimulate(
     connections: Sequence[tuple[str, str]],
     span: Simulate,
     starts: Mapping[str, Mapping[str, float]],
+    store: Store | None = None,
 ) -> Trajectories:
     """Step components in lockstep over `span`, with progress and Ctrl-C minded."""
     from exlinn_fmi.cosim.graph import Graph
+    from exlinn_fmi.cosim.loops import LoopOptions
     from exlinn_fmi.cosim.master import Master
 
     specs = work.scenario.components
     own_steps = {name: step for name in components if name in specs and (step := specs[name].step)}
     graph = Graph(components, connections)
-    master = Master(graph, span.start, span.stop, span.step, own_steps, span.algorithm, span.record)
-    return master.run(starts, lambda part, t: work.reporter.update(part, f"t = {t:.3f} s"), work.stop)
+    loops = span.loop_settings
+    master = Master(
+        graph,
+        span.start,
+        span.stop,
+        span.step,
+        own_steps,
+        span.algorithm,
+        span.record,
+        record_every=span.record_every,
+        loops=LoopOptions(**loops.model_dump()) if loops else None,
+    )
+    report = lambda part, t: work.reporter.update(part, f"t = {t:.3f} s")  # noqa: E731
+    return master.run(starts, report, work.stop, store, span.pace)
+
+
+def store_of(work: Run, span: Simulate, key: str, resume: bool) -> Store | None:
+    """Where a run keeps its rows, None where they stay in memory."""
+    from exlinn_fmi.cosim.store import Store
+
+    if span.stream is False and span.checkpoint is None and not resume:
+        return None
+    return Store(work.folder / "simulate.part", span.checkpoint, key, resume, always=bool(span.stream))
 
 
 def experiment(work: Run, learn: LearnFromPlant) -> Dataset:

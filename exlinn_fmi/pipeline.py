@@ -12,9 +12,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from exlinn_fmi.data.files import write_table, write_text
+from exlinn_fmi.data.files import write_rows, write_table, write_text
 from exlinn_fmi.errors import ExlinnError, InputError, RunError
-from exlinn_fmi.experiment import cosimulate, experiment
+from exlinn_fmi.experiment import cosimulate, experiment, store_of
 from exlinn_fmi.factory import inspect
 from exlinn_fmi.stages import fingerprint
 from exlinn_fmi.workspace import Reporter, Run, Silent, metrics
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from exlinn_fmi.data.dataset import Dataset
 
 
-def run(work: Run) -> dict[str, Any]:
+def run(work: Run, resume: bool = False) -> dict[str, Any]:
     """Do everything that the scenario asks for; the metrics are returned and stand in ``metrics.json``."""
     try:
         if work.scenario.learn is not None:
             train(work)
         if work.scenario.simulate is not None:
-            simulate(work)
+            simulate(work, resume)
     except RunError:
         # The report shows what there is so far; should it fail as well, the first error is the one to tell.
         with suppress(ExlinnError):
@@ -144,10 +144,15 @@ def design(work: Run) -> None:
         work.done("design", key, written, began)
 
 
-def simulate(work: Run) -> None:
+def simulate(work: Run, resume: bool = False) -> None:
     """Step all components of the scenario in lockstep; save trajectories and judge the closed loop.
 
+    Args:
+        work: the scenario.
+        resume: whether to go on from the last checkpoint of a run that was stopped or killed.
+
     Raises:
+        InputError: there is no checkpoint to go on from.
         RunError: a component failed, or the user stopped the run; the rows so far are on disk.
     """
     scenario, span = work.scenario, work.scenario.simulate
@@ -172,8 +177,18 @@ def simulate(work: Run) -> None:
         components = with_events(components, scenario.events, scenario.seed, span.step)
         span = span.model_copy(update={"record": [*span.record, f"{MONITOR}.*"]})
     starts = {name: spec.start for name, spec in scenario.components.items()}
-    result = cosimulate(work, components, scenario.connection_list(), span, starts)
-    written = write_table(work.folder / "trajectories", result.frame, result.units)
+    store = store_of(work, span, key, resume)
+    result = cosimulate(work, components, scenario.connection_list(), span, starts, store)
+    stem = work.folder / "trajectories"
+    if result.rows is None:
+        written = write_table(stem, result.frame, result.units)
+    else:
+        written = write_rows(stem, list(map(str, result.frame)), result.units, result.rows.blocks())
+    if store is not None and (result.error is None or span.checkpoint is None):
+        store.remove()
+    if result.rows is not None and len(result.frame) < result.rows.rows:
+        share = round(result.rows.rows / len(result.frame))
+        work.warn(f"metrics and figures are made of every {share}th of {result.rows.rows} rows")
     statistics = {f"simulate.{k}": v for k, v in result.statistics.items() if isinstance(v, int | float)}
     judged = control_metrics(result.frame, scenario, result.units)
     work.replace_metrics(("control.", "simulate."), judged | statistics)

@@ -31,8 +31,8 @@ def unpack(data: bytes) -> Any:
 def _mark(value: object) -> Any:
     """A value in JSON's types."""
     if isinstance(value, np.generic):
-        value = np.asarray(value)
-    if value is None or isinstance(value, bool | int | float | str):
+        return {_KIND: "scalar", "array": _mark(np.asarray(value))}
+    if value is None or type(value) in (bool, int, float, str):
         return value
     if isinstance(value, list):
         return [_mark(v) for v in value]
@@ -55,6 +55,8 @@ def _restore(mapping: dict[str, Any]) -> Any:
             return tuple(mapping["items"])
         case "bytes":
             return base64.b64decode(mapping["data"])
+        case "scalar":
+            return mapping["array"][()]
         case "array":
             flat = np.frombuffer(base64.b64decode(mapping["data"]), dtype=mapping["dtype"])
             return flat.reshape(mapping["shape"]).copy()

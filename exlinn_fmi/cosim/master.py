@@ -163,7 +163,7 @@ class Master:
                 self._seidel,
                 self._loops,
             )
-            error = self._attempt(plan, recorder, starts, watch)
+            error = self._attempt(plan, recorder, starts, watch) or _flush(recorder)
         finally:
             faults = _close(components)
         for number, text in faults:
@@ -176,17 +176,14 @@ class Master:
                 name: seconds + float(more)
                 for name, seconds, more in zip(self.graph.names, timed, inside, strict=True)
             }
-        frame = recorder.frame()
-        if recorder.file is not None:
-            recorder.file.close()
-        return Trajectories(frame, recorder.units, error, statistics, recorder.file)
+        return Trajectories(recorder.frame(), recorder.units, error, statistics, recorder.file)
 
     def _recorder(self, store: Store | None) -> Recorder:
         """An empty table for time and recorded variables."""
         names = [TIME, *map(self.graph.path, self.recorded)]
         stated = [self.graph.variable(port).unit for port in self.recorded]
         units = {name: unit for name, unit in zip(names, ["s", *stated], strict=True) if unit is not None}
-        file = None if store is None else store.row_file(len(names))
+        file = None if store is None else store.row_file(self.ticks // self._every + 1, len(names))
         return Recorder(names, units, self.ticks, self._every, file)
 
     def _attempt(
@@ -263,6 +260,15 @@ def _check_names(graph: Graph, what: str, named: Iterable[str]) -> None:
     for name in named:
         if name not in graph.components:
             raise InputError(f"{what}: no component {name!r}; {nearest(name, graph.names, 'components')}")
+
+
+def _flush(recorder: Recorder) -> RunError | None:
+    """Write what rows are left; an error is returned."""
+    try:
+        recorder.flush()
+    except RunError as error:
+        return error
+    return None
 
 
 def _close(components: Sequence[Component]) -> list[tuple[int, str]]:

@@ -122,10 +122,14 @@ class Recorder:
         return room
 
     def flush(self) -> None:
-        """Have all rows in the file, and begin a new block."""
-        assert self.file is not None
-        self.file.append(self.table[: self.rows - self.base])
-        self.base = self.rows
+        """Have all rows in the file, if there is one, and begin a new block.
+
+        Raises:
+            StorageError: they cannot be written; they are lost then.
+        """
+        if self.file is not None:
+            rows, self.base = self.table[: self.rows - self.base], self.rows
+            self.file.append(rows)
 
     def go_on(self, rows: int) -> None:
         """Begin after the first so many rows of the file."""
@@ -138,7 +142,6 @@ class Recorder:
         import pandas as pd
 
         if self.file is not None:
-            self.flush()
             return pd.DataFrame(self.file.thinned(), columns=self.names)
         # The copy of a run that ended early does not hold the memory of the rows that it lacks.
         return pd.DataFrame(self.table[: self.rows], columns=self.names, copy=self.rows < len(self.table))

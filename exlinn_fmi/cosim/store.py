@@ -8,6 +8,7 @@ the disk: whenever the run is killed, the two fit together.
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,11 +45,13 @@ class RowFile:
     """
 
     def __init__(self, path: Path, columns: int, keep: bool = False) -> None:
-        self.path, self.columns = path, columns
+        self.path, self.columns, self.rows = path, columns, 0
         with _explained(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._stream = path.open("r+b" if keep else "w+b")
-        self.rows = path.stat().st_size // (8 * columns)
+            if keep and path.exists():
+                self.rows = path.stat().st_size // (8 * columns)
+            else:
+                path.write_bytes(b"")
 
     @property
     def block(self) -> int:
@@ -57,8 +60,7 @@ class RowFile:
 
     def cut(self, rows: int) -> None:
         """Forget all rows after the first so many."""
-        self._stream.truncate(8 * self.columns * rows)
-        self._stream.seek(0, os.SEEK_END)
+        os.truncate(self.path, 8 * self.columns * rows)
         self.rows = rows
 
     def append(self, rows: Rows) -> None:
@@ -68,14 +70,18 @@ class RowFile:
             StorageError: the disk is full, …
         """
         with _explained(self.path):
-            self._stream.write(rows.tobytes())
-            self._stream.flush()
+            try:
+                with self.path.open("ab") as stream:
+                    stream.write(rows.tobytes())
+            except OSError:
+                self.cut(self.rows)  # part of them may be there
+                raise
         self.rows += len(rows)
 
     def sync(self) -> None:
         """Have all rows on the disk."""
-        with _explained(self.path):
-            os.fsync(self._stream.fileno())
+        with _explained(self.path), self.path.open("rb+") as stream:
+            os.fsync(stream.fileno())
 
     def blocks(self) -> Iterator[Rows]:
         """All rows, some at a time."""
@@ -92,10 +98,6 @@ class RowFile:
             first += len(block)
         return np.concatenate(parts)
 
-    def close(self) -> None:
-        """Close the file; what is in it stays."""
-        self._stream.close()
-
 
 class Store:
     """Where a run keeps rows and checkpoints.
@@ -105,18 +107,33 @@ class Store:
         every: wall time between two checkpoints [s]; without it there are none.
         key: of the run; a checkpoint of another run is refused.
         resume: whether to go on from the checkpoint there.
+        always: whether rows are kept here also if they fit into memory well and there are no checkpoints.
     """
 
-    def __init__(self, folder: Path, every: float | None = None, key: str = "", resume: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        every: float | None = None,
+        key: str = "",
+        resume: bool = False,
+        always: bool = False,
+    ) -> None:
         self.folder, self.every, self.key, self.resume = folder, every, key, resume
+        self._always = always or resume or every is not None
 
     @property
     def _file(self) -> Path:
         return self.folder / "checkpoint.json"
 
-    def row_file(self, columns: int) -> RowFile:
-        """The file for rows."""
+    def row_file(self, rows: int, columns: int) -> RowFile | None:
+        """The file for so many rows; None where they stay in memory."""
+        if not self._always and 8 * rows * columns <= FULL_FRAME:
+            return None
         return RowFile(self.folder / "rows.f64", columns, keep=self.resume)
+
+    def remove(self) -> None:
+        """Remove all of it."""
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def save(self, state: Mapping[str, Any], rows: RowFile) -> None:
         """Write a checkpoint.

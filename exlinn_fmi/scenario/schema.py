@@ -2,14 +2,14 @@
 
 The other parts take these models as their options (`learn` a `Learn`, `control` an `Nmpc`, …), so that each
 setting is written down once. The JSON Schema that editors use is generated from here. Sections with much to
-say have files of their own: `signals.py`, `control.py`, `learning.py`.
+say have files of their own: `signals.py`, `control.py`, `learning.py`, `simulation.py`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Discriminator, Field, Tag
 
@@ -17,6 +17,7 @@ from exlinn_fmi.scenario.control import Nmpc
 from exlinn_fmi.scenario.events import Event
 from exlinn_fmi.scenario.learning import AnyLearn
 from exlinn_fmi.scenario.signals import Signal
+from exlinn_fmi.scenario.simulation import Simulate as Simulate
 from exlinn_fmi.scenario.spec import (
     Name,
     NonNegative,
@@ -128,19 +129,6 @@ ComponentSpec = Annotated[
 ]
 
 # ── the scenario ─────────────────────────────────────────────────────────────────────────────────────────
-
-
-class Simulate(Spec):
-    """Run the connected components in co-simulation."""
-
-    start: float = Field(0.0, description="start time [s]")
-    stop: float = Field(description="stop time [s]")
-    step: Positive = Field(1e-3, description="communication step [s]")
-    algorithm: Literal["jacobi", "gauss-seidel"] = Field("jacobi", description="master algorithm")
-    record: list[str] = Field(
-        default_factory=lambda: ["*"],
-        description="variables to record, with wildcards; inputs and outputs of all by default",
-    )
 
 
 Paths = Annotated[

@@ -1,0 +1,126 @@
+"""A run that is killed at any instant goes on from its last checkpoint as if nothing had happened."""
+
+from __future__ import annotations
+
+import json
+import random
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from exlinn_fmi.cli import exit_code
+
+SCENARIO = """
+name: long
+components:
+  drive: {source: {signal: multisine, rms: 4, band: [0.1, 5], offset: 3, seed: 1, unit: V}}
+  motor: {plant: dc_motor_cart}
+  lag: {python: "parts:Lag", step: 4.0e-3}
+connections: {drive.y: motor.v, motor.i: lag.u}
+simulate: {stop: 20, step: 1.0e-3, record: ["*.i", "lag.y", "drive.y", "motor.alpha"], CHECKPOINT}
+"""
+
+PARTS = """
+from exlinn_fmi import PythonComponent, Variable
+
+class Lag(PythonComponent):
+    variables = (Variable("u", "input", unit="A"), Variable("y", "output", unit="A", depends_on=()))
+
+    def initialize(self, start_time, stop_time):
+        self.x = 0.0
+
+    def outputs(self, t):
+        self["y"] = self.x
+
+    def advance(self, t, h):
+        self.x += h / 0.3 * (self["u"] - self.x)
+
+    def get_state(self):
+        return self.x
+
+    def set_state(self, state):
+        self.x = state
+"""
+
+
+def write(folder: Path, checkpoint: str) -> Path:
+    (folder / "parts.py").write_text(PARTS)
+    file = folder / "long.yaml"
+    file.write_text(SCENARIO.replace("CHECKPOINT", checkpoint))
+    return file
+
+
+def start(file: Path, out: Path, *more: str) -> subprocess.Popen[bytes]:
+    code = "from exlinn_fmi.cli import main; main()"
+    command = [sys.executable, "-c", code, "simulate", str(file), "--out", str(out), *more]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+
+def test_a_killed_run_goes_on_to_the_same_last_bit(tmp_path: Path):
+    file, out = write(tmp_path, "checkpoint: 0.05"), tmp_path / "killed"
+    assert exit_code(["simulate", str(file), "--out", str(tmp_path / "whole")]) == 0
+    chance, kills, more = random.Random(5), 0, []
+    for _ in range(4):
+        process = start(file, out, *more)
+        checkpoint = out / "simulate.part" / "checkpoint.json"
+        before = checkpoint.stat().st_mtime_ns if checkpoint.exists() else None
+        deadline = time.monotonic() + 60
+        while process.poll() is None and time.monotonic() < deadline:
+            now = checkpoint.stat().st_mtime_ns if checkpoint.exists() else None
+            if now != before:  # it has begun; from now on at any instant
+                time.sleep(chance.uniform(0.05, 0.4))
+                break
+            time.sleep(0.01)
+        if process.poll() is None:
+            process.kill()
+            kills += 1
+        process.communicate()
+        more = ["--resume"]
+        if process.returncode == 0:
+            break
+    if process.returncode != 0:
+        assert start(file, out, "--resume").wait(timeout=120) == 0
+    assert kills >= 1
+    assert (out / "trajectories.csv").read_bytes() == (tmp_path / "whole" / "trajectories.csv").read_bytes()
+    assert not (out / "simulate.part").exists()
+
+
+def test_without_a_checkpoint_there_is_nothing_to_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    file = write(tmp_path, "start: 0.0")
+    assert exit_code(["simulate", str(file), "--out", str(tmp_path / "out"), "--resume"]) == 1
+    assert "there is no checkpoint to go on from; say `checkpoint: 60`" in capsys.readouterr().err
+
+
+def test_rows_stream_into_the_same_files(tmp_path: Path):
+    out = {}
+    for stream in ("true", "false"):
+        file = write(tmp_path, f"stream: {stream}, record_every: 10")
+        out[stream] = tmp_path / stream
+        assert exit_code(["simulate", str(file), "--out", str(out[stream]), "--set", "simulate.stop=2"]) == 0
+    assert (out["true"] / "trajectories.csv").read_bytes() == (out["false"] / "trajectories.csv").read_bytes()
+    frames = [pd.read_parquet(folder / "trajectories.parquet") for folder in out.values()]
+    assert frames[0].equals(frames[1])
+    assert len(frames[0]) == 201
+    meta = [json.loads((folder / "trajectories.meta.json").read_text()) for folder in out.values()]
+    assert meta[0] == meta[1]
+
+
+def test_what_is_recorded_can_be_said_on_the_command_line(tmp_path: Path):
+    file = write(tmp_path, "start: 0.0")
+    line = ["simulate", str(file), "--out", str(tmp_path / "out"), "--set", "simulate.stop=0.1"]
+    assert exit_code([*line, "--record", "motor.al*", "--record", "drive.y"]) == 0
+    columns = list(pd.read_csv(tmp_path / "out" / "trajectories.csv"))
+    assert columns == ["time", "motor.alpha", "motor.alpha_dot", "motor.alpha_ddot", "drive.y"]
+
+
+def test_a_paced_run_reports_its_deadlines(tmp_path: Path):
+    file = write(tmp_path, "pace: 2")
+    line = ["simulate", str(file), "--out", str(tmp_path / "out"), "--set", "simulate.stop=0.5"]
+    assert exit_code(line) == 0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["simulate.seconds"] >= 0.25
+    assert "simulate.missed_deadlines" in metrics
