@@ -133,37 +133,40 @@ class Component(ABC):
         """Go back to a state that `save_state` returned."""
         raise NotImplementedError(f"{self.name} cannot restore its state; ask can_save_state first")
 
-    def serialize_state(self) -> bytes:
-        """The whole state as bytes that another process can go on from.
+    @property
+    def can_serialize_state(self) -> bool:
+        """Whether `serialize_state` and `deserialize_state` work."""
+        return False
+
+    def serialize_state(self, state: object) -> bytes:
+        """A state that `save_state` returned, as bytes that another process can go on from.
 
         Raises:
-            NotImplementedError: it cannot; the text says why.
+            NotImplementedError: it cannot be done for what is in this one; the text says why.
         """
-        raise NotImplementedError("it cannot write its state as bytes")
+        raise NotImplementedError(f"{self.name} cannot serialize its state; ask can_serialize_state first")
 
-    def deserialize_state(self, data: bytes) -> None:
-        """Go on from a state that `serialize_state` gave, in a component that is initialised alike."""
-        raise NotImplementedError("it cannot read its state from bytes")
+    def deserialize_state(self, data: bytes) -> object:
+        """A state for `restore_state`, from bytes that `serialize_state` gave in a run begun alike."""
+        raise NotImplementedError(f"{self.name} cannot deserialize a state; ask can_serialize_state first")
 
     @property
-    def gives_derivatives(self) -> bool:
+    def gives_directional_derivatives(self) -> bool:
         """Whether `directional_derivative` works."""
         return False
 
-    def directional_derivative(
-        self, outputs: Indices, inputs: Indices, seed: Values, derivative: Values
-    ) -> Status:
-        """Write the derivative of `outputs` (k,) along `seed` (n,), a change of `inputs`, to `derivative`."""
-        raise NotImplementedError(f"{self.name} gives no derivatives; ask gives_derivatives first")
+    def directional_derivative(self, unknowns: Indices, knowns: Indices, seed: Values) -> Values:
+        """∂(unknowns)/∂(knowns) · seed at the present point: outputs (n,) along a direction (k,)."""
+        raise NotImplementedError(f"{self.name} has none; ask gives_directional_derivatives first")
 
     @property
-    def input_derivatives(self) -> int:
-        """Highest order of time derivatives of inputs that `set_input_derivatives` takes, 0 where none."""
-        return 0
+    def takes_input_derivatives(self) -> bool:
+        """Whether `set_input_derivatives` works."""
+        return False
 
-    def set_input_derivatives(self, indices: Indices, order: int, values: Values) -> Status:
-        """Set time derivatives of inputs [unit/s^order] that hold for the next step, after `set`."""
-        raise NotImplementedError(f"{self.name} takes no derivatives of inputs; ask input_derivatives first")
+    def set_input_derivatives(self, indices: Indices, derivatives: Values) -> Status:
+        """Let continuous inputs (k,) go on from where they are by `derivatives` [unit/s] over the next step."""
+        raise NotImplementedError(f"{self.name} takes none; ask takes_input_derivatives first")
 
     def native(self) -> Native | None:
         """The C functions behind `set`, `get` and `step`, for compiled stepping; None where there are none.

@@ -182,13 +182,22 @@ class PythonComponent(Component):
         self.values[:], self._time, self._outdated, own = state
         self.set_state(own)
 
-    def serialize_state(self) -> bytes:
-        """What `save_state` returns, if `get_state` returns plain values (numbers, texts, arrays, lists)."""
-        return pack(self.save_state())
+    @property
+    def can_serialize_state(self) -> bool:
+        """If `get_state` returns plain values: numbers, texts, arrays, lists, tuples, dictionaries."""
+        return True
 
-    def deserialize_state(self, data: bytes) -> None:
-        """Go on from what `serialize_state` returned."""
-        self.restore_state(unpack(data))
+    def serialize_state(self, state: object) -> bytes:
+        """A state as bytes.
+
+        Raises:
+            NotImplementedError: `get_state` returned something else.
+        """
+        return pack(state)
+
+    def deserialize_state(self, data: bytes) -> object:
+        """A state from bytes."""
+        return unpack(data)
 
     def close(self) -> None:
         """Nothing is held."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from exlinn_fmi.components.base import Indices, Status, Values
+from exlinn_fmi.components.base import Indices, Values
 from exlinn_fmi.errors import ComponentError, LoopError
 
 if TYPE_CHECKING:
@@ -64,7 +64,9 @@ class Loops:
         self._real = np.array([plan.graph.variable(port).type == "Real" for port in torn])
         self._inverse: Values | None = None
         self._by_derivatives = all(
-            plan.components[x.component].gives_derivatives for _, x in self._visits if x.outputs is not None
+            plan.components[x.component].gives_directional_derivatives
+            for _, x in self._visits
+            if x.outputs is not None
         )
         self.passes, self.worst = 0, 0.0
 
@@ -213,7 +215,7 @@ class Loops:
     def _jacobian(self, x: Values, g: Values, visits: Sequence[Exchange], t: float) -> Values:
         """∂G/∂x; values that are no real numbers count as constant."""
         if self._by_derivatives:
-            matrix = self._along_directions(visits, t)
+            matrix = self._along_directions(visits)
         else:
             matrix = np.zeros((len(x), len(x)))
             for j in np.flatnonzero(self._real):
@@ -223,7 +225,7 @@ class Loops:
                 matrix[:, j] = (self._plan.signals[self._plan.hold_from] - g) / (moved[j] - x[j])
         return np.where(np.outer(self._real, self._real), matrix, 0.0)
 
-    def _along_directions(self, visits: Sequence[Exchange], t: float) -> Values:
+    def _along_directions(self, visits: Sequence[Exchange]) -> Values:
         """∂G/∂x from the components' directional derivatives, carried around the loops."""
         plan = self._plan
         tangent = np.zeros((len(plan.hold_to), len(plan.signals)))
@@ -237,20 +239,12 @@ class Loops:
                 continue
             inputs, sources = (np.concatenate(part) for part in zip(*so_far, strict=True))
             place = list(plan.places(x.taken))
+            component = plan.components[x.component]
             for direction in tangent:
-                direction[place] = self._derive(x, inputs, direction[sources], t)
+                seed = direction[sources]
+                if seed.any():
+                    direction[place] = component.directional_derivative(x.outputs, inputs, seed)
         return tangent[:, plan.hold_from].T
-
-    def _derive(self, x: Exchange, inputs: Indices, seed: Values, t: float) -> Values:
-        """One directional derivative of what an exchange gets."""
-        assert x.outputs is not None
-        derivative = np.zeros(len(x.outputs))
-        if seed.any():
-            component = self._plan.components[x.component]
-            status = component.directional_derivative(x.outputs, inputs, seed, derivative)
-            if status != Status.OK:
-                self._plan.judge(x.component, status, "a directional derivative", t)
-        return derivative
 
 
 def _ports(x: Exchange) -> set[tuple[int, int]]:

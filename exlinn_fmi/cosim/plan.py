@@ -357,7 +357,10 @@ class Plan:
         states, problems = {}, []
         for name, component in zip(self.graph.names, self.components, strict=True):
             try:
-                states[name] = component.serialize_state()
+                if component.can_serialize_state:
+                    states[name] = component.serialize_state(component.save_state())
+                else:
+                    problems.append(f"{name}: it has no way to")
             except NotImplementedError as error:
                 problems.append(f"{name}: {error}")
         if problems:
@@ -374,7 +377,7 @@ class Plan:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from what `save` gave, in components that are initialised alike."""
         for name, component in zip(self.graph.names, self.components, strict=True):
-            component.deserialize_state(state["components"][name])
+            component.restore_state(component.deserialize_state(state["components"][name]))
         self.signals[:], self.ahead[:] = state["signals"], state["ahead"]
         self.warnings = {name: Warned(*warned) for name, warned in state["warnings"].items()}
         if self.loops is not None:

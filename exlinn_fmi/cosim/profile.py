@@ -69,37 +69,40 @@ class Timed(Component):
         self.seconds += perf_counter() - began
         return status
 
-    def serialize_state(self) -> bytes:
+    @property
+    def can_serialize_state(self) -> bool:
         """As the inner component."""
-        return self._inner.serialize_state()
+        return self._inner.can_serialize_state
 
-    def deserialize_state(self, data: bytes) -> None:
+    def serialize_state(self, state: object) -> bytes:
         """As the inner component."""
-        self._inner.deserialize_state(data)
+        return self._inner.serialize_state(state)
+
+    def deserialize_state(self, data: bytes) -> object:
+        """As the inner component."""
+        return self._inner.deserialize_state(data)
 
     @property
-    def gives_derivatives(self) -> bool:
+    def gives_directional_derivatives(self) -> bool:
         """As the inner component."""
-        return self._inner.gives_derivatives
+        return self._inner.gives_directional_derivatives
 
-    def directional_derivative(
-        self, outputs: Indices, inputs: Indices, seed: Values, derivative: Values
-    ) -> Status:
+    def directional_derivative(self, unknowns: Indices, knowns: Indices, seed: Values) -> Values:
         """Measured."""
         began = perf_counter()
-        status = self._inner.directional_derivative(outputs, inputs, seed, derivative)
+        derivative = self._inner.directional_derivative(unknowns, knowns, seed)
         self.seconds += perf_counter() - began
-        return status
+        return derivative
 
     @property
-    def input_derivatives(self) -> int:
+    def takes_input_derivatives(self) -> bool:
         """As the inner component."""
-        return self._inner.input_derivatives
+        return self._inner.takes_input_derivatives
 
-    def set_input_derivatives(self, indices: Indices, order: int, values: Values) -> Status:
+    def set_input_derivatives(self, indices: Indices, derivatives: Values) -> Status:
         """Measured."""
         began = perf_counter()
-        status = self._inner.set_input_derivatives(indices, order, values)
+        status = self._inner.set_input_derivatives(indices, derivatives)
         self.seconds += perf_counter() - began
         return status
 
