@@ -165,7 +165,7 @@ class Component(ABC):
         return False
 
     def set_input_derivatives(self, indices: Indices, derivatives: Values) -> Status:
-        """Let continuous inputs (k,) go on from where they are by `derivatives` [unit/s] over the next step."""
+        """Let continuous inputs (k,) change by `derivatives` [unit/s] over the next step."""
         raise NotImplementedError(f"{self.name} takes none; ask takes_input_derivatives first")
 
     def native(self) -> Native | None:
