@@ -104,7 +104,7 @@ def discovery(level: float, seed: int) -> Found:
     """From generic terms, no accelerations."""
     data = noisy(level, 5000 + 2 * seed)
     basis = generic_basis(data)
-    *_, found = discover(basis, data)
+    *_, found = discover(basis, None, data)
     terms = basis.only(found.chosen)
     exact = (set(terms.lagrangian), set(terms.dissipation)) == (
         set(FAMILY.lagrangian),

@@ -260,17 +260,17 @@ def spread_over(
 
 def discover(
     basis: MonomialBasis,
+    first: Bool[NDArray[np.bool_], " T"] | None,
     data: Dataset,
     known: Float[Array, " P"] | None = None,
-    first: Bool[NDArray[np.bool_], " T"] | None = None,
 ) -> Iterator[Discovery]:
     """Find the terms that trajectories need; yields after the first fit, each pruning and the last fit.
 
     Args:
         basis: the generic family.
+        first: terms that are looked at; all of them if None.
         data: trajectories.
         known: parameters that are held, NaN for the others.
-        first: terms that are looked at; all of them if not given.
     """
     names, inputs = state_names(basis.coordinates), input_names(basis.coordinates)
     size = data.frame[names].std().to_numpy()

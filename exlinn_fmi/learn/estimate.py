@@ -22,6 +22,7 @@ from exlinn_fmi.learn.identify import Identified, Unknowns, parameter_table
 from exlinn_fmi.learn.noise import CLEAN
 from exlinn_fmi.learn.terms import choose, linear_fit, regress
 from exlinn_fmi.learn.trajectory import Fit, cut, maximum_likelihood
+from exlinn_fmi.learn.weak import inverse_regression
 from exlinn_fmi.scenario.learning import Identify, Objective
 
 Array = NDArray[np.float64]
@@ -74,12 +75,14 @@ def estimate(data: Dataset, options: Identify, truth: Mapping[str, float], objec
             reason = f"the monomials leave residuals of {excess:.3g} times the noise"
             return Estimate(None, f"read off the learned model: {reason}")
         misfit = float((fit.sigma / size).max())
+        regression = inverse_regression(basis, data, fit.p)
     else:
         make, windows = regress(basis, data, chosen)
         fit = linear_fit(make, basis.start, windows, known=known)
-        misfit = make(fit.p).misfit(fit.p)
-    lost, groups = unknowns.lost(fit.information)
-    told = "".join(f"; not identifiable apart from these data: {group}" for group in groups)
+        regression = make(fit.p)
+        misfit = regression.misfit(fit.p)
+    lost, doubts = unknowns.lost(fit.information, regression)
+    told = "".join(f"; not identifiable: {doubt}" for doubt in doubts)
     held = ", ".join(f"{n} = {x:g}" for n, x in zip(unknowns.names, known, strict=True) if np.isfinite(x))
     told += f"; held: {held}" if held else ""
     return Estimate(Identified(_table(unknowns, fit, lost, truth), misfit), why + told)

@@ -74,13 +74,52 @@ class Unknowns(NamedTuple):
         known = [options.known.get(name, np.nan) for name in options.names]
         return cls(basis, options.names, np.array(known, dtype=float))
 
-    def lost(self, information: Information) -> tuple[Bool[NDArray[np.bool_], " P"], list[str]]:
-        """Parameters that the data do not tell, and in words what cannot be told apart."""
-        free = np.flatnonzero(np.isnan(self.known))
-        unknown = np.abs(information.unknown) > PART
-        lost = np.zeros(len(self.names), dtype=bool)
-        lost[free[unknown.any(axis=0)]] = True
-        return lost, [" and ".join(np.array(self.names)[free[row]]) for row in unknown]
+    def lost(
+        self, information: Information, regression: Regression
+    ) -> tuple[Bool[NDArray[np.bool_], " P"], list[str]]:
+        """Parameters that the data do not tell, and in words what cannot be told.
+
+        Args:
+            information: what the data tell of the parameters that are not held.
+            regression: the equations of motion at the parameters found.
+        """
+        names, free = np.array(self.names), np.flatnonzero(np.isnan(self.known))
+        lost, told = np.zeros(len(names), dtype=bool), []
+        for part in self._without_force(regression):
+            lost[part] = True
+            told.append(
+                f"the common scale of {' and '.join(names[part])}: no input acts on what they move, and no "
+                "coupling ties it to one"
+            )
+        for row in np.abs(information.unknown) > PART:
+            part = free[row]
+            if not lost[part].all():
+                single = "not seen in these data" if len(part) == 1 else "only a combination is seen"
+                told.append(f"{' and '.join(names[part])}: {single}")
+            lost[part] = True
+        return lost, told
+
+    def _without_force(self, regression: Regression) -> list[NDArray[np.intp]]:
+        """Sets of parameters in equations without any force: whatever their scale, they explain nothing.
+
+        Parameters that occur in one equation belong together, and so do equations that share a parameter.
+        """
+        linear = regression.columns[:, :, : regression.terms]
+        size = np.sqrt(np.sum(linear**2, axis=0))  # (n, T)
+        occurs = size > np.finfo(float).eps * size.max(initial=0.0)
+        driven = np.any(regression.force != 0, axis=0)
+        sets, left = [], set(range(len(occurs)))
+        while left:
+            equations, grown = {left.pop()}, True
+            while grown:
+                terms = occurs[sorted(equations)].any(axis=0)
+                more = set(np.flatnonzero(occurs[:, terms].any(axis=1)).tolist())
+                grown, equations = not more <= equations, equations | more
+            left -= equations
+            held = terms & ~np.isnan(self.known[: regression.terms])
+            if not driven[sorted(equations)].any() and not held.any() and terms.any():
+                sets.append(np.flatnonzero(terms))
+        return sets
 
 
 def identify(
@@ -109,15 +148,18 @@ def identify(
     a = np.abs(samples.a).max(axis=0) * random.uniform(-1, 1, v.shape)
     force = evaluate(system.inverse, q, v, a, np.zeros(0))
     weight = 1 / np.maximum(np.sqrt(np.mean(force**2, axis=0)), np.finfo(float).tiny)
+    driven = np.any(samples.F != 0, axis=0)
 
     def make(p: Float[Array, " P"]) -> Regression:
         columns = evaluate(basis.regressor, q, v, a, p).reshape(*v.shape, len(p))
         return Regression(columns * weight[:, None], force * weight, basis.size)
 
     fit = linear_fit(make, basis.start, 1, known=unknowns.known)
-    lost, _ = unknowns.lost(fit.information)
+    at = make(fit.p)
+    # The learned model has forces everywhere; what scale they have is known only where an input acts.
+    lost, _ = unknowns.lost(fit.information, at._replace(force=at.force * driven))
     table = parameter_table(unknowns.names, np.where(lost, np.nan, fit.p), truth)
-    return Identified(table, make(fit.p).misfit(fit.p))
+    return Identified(table, at.misfit(fit.p))
 
 
 def parameter_table(names: list[str], values: Float[Array, " K"], truth: Mapping[str, float]) -> pd.DataFrame:

@@ -8,7 +8,7 @@ deviation, which goes into the model's provenance.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
@@ -37,10 +37,10 @@ Array = NDArray[np.float64]
 
 STAGES = 5
 """About as many iterates does the learner give."""
-CONSISTENT = 1e-4
+CONSISTENT = 1e-8
 """Accelerations that leave no more than this share of the forces unexplained were measured, or as good as."""
-BETTER = 0.1
-"""If not, and the weak form leaves less than this share of that, the accelerations are not to be trusted."""
+RESOLVED = 1e-4
+"""If not, and the weak form leaves less than this share, the terms are right and accelerations are not."""
 LEAST_MISFIT = 1e-6
 """Terms are judged as if forces had at least this noise, as a share of their size."""
 EXPLAINED = 1.1
@@ -91,13 +91,14 @@ def choose(
             f"trajectory: {worst} has {100 * noise[worst]:.2g} % noise, the most of all states",
         )
     misfit = _misfit(inverse_regression, basis, data, known)
-    # Where neither fits it is the terms that fall short: no objective mends that.
-    if misfit > CONSISTENT and _misfit(weak_regression, basis, data, known) < BETTER * misfit:
-        return (
-            "trajectory",
-            f"trajectory: states are clean, but {100 * misfit:.2g} % of forces do not fit the accelerations",
-        )
+    # Where not even the weak form fits it is the terms that fall short: no objective mends that.
+    if misfit > CONSISTENT and _misfit(weak_regression, basis, data, known) < RESOLVED:
+        return "trajectory", _doubt(misfit)
     return "inverse", "inverse: the states are clean and the accelerations do not contradict them"
+
+
+def _doubt(misfit: float) -> str:
+    return f"trajectory: states are clean, but {100 * misfit:.2g} % of forces do not fit the accelerations"
 
 
 def _misfit(
@@ -130,14 +131,8 @@ def iterate_terms(
     basis = spec.basis
     names = [*basis.terms, *(shape.name for shape in basis.shapes)]
     held = np.array([known.get(name, np.nan) for name in names], dtype=float)
-    at_start = np.arange(len(names)) >= basis.size  # shapes do not matter for this choice
-    chosen, why = choose(objective, basis, train, np.where(at_start, basis.start, held))
-    basis, first = narrow(basis, train, "inverse" if chosen == "inverse" else "weak", held)
-    if chosen == "trajectory":
-        found = discover(basis, train, held, first)
-    else:
-        found = _least_squares(basis, train, chosen, held, first)
-    judge = prediction_error if chosen == "trajectory" else force_misfit
+    found, why = _stages(basis, train, objective, held)
+    judge = prediction_error if why.startswith("trajectory") else force_misfit
     for step, now in enumerate(found):
         p, count = now.p, len(basis.lagrangian)
         yield Iterate(
@@ -153,6 +148,28 @@ def iterate_terms(
             step,
             _notes(basis, now, why, train),
         )
+
+
+def _stages(
+    basis: MonomialBasis, data: Dataset, objective: Objective, held: Float[Array, " P"]
+) -> tuple[Iterable[Discovery], str]:
+    """What is done one after the other, and why.
+
+    Clean data are fitted by least squares. What this leaves tells whether the accelerations are as clean as
+    the states; if not, the weak form tells all but a few terms apart, and those are fitted to trajectories.
+    """
+    if objective != "auto" or not even(data) or max(relative_noise(data).values()) > CLEAN:
+        chosen, why = choose(objective, basis, data)
+        if chosen != "trajectory":
+            return _least_squares(basis, data, chosen, held), why
+        return discover(*narrow(basis, data, "weak", held), data, held), why
+    stages = list(_least_squares(basis, data, "inverse", held))
+    misfit = np.sqrt(force_misfit(stages[-1].basis, stages[-1].p, data))
+    if misfit > CONSISTENT:
+        *_, weak = _least_squares(basis, data, "weak", held)
+        if weak_regression(weak.basis, data, weak.p).misfit(weak.p) < RESOLVED:
+            return discover(weak.basis, weak.chosen, data, held), _doubt(misfit)
+    return stages, "inverse: the states are clean and the accelerations do not contradict them"
 
 
 def narrow(
@@ -200,9 +217,9 @@ def _least_squares(
     data: Dataset,
     objective: Objective,
     known: Float[Array, " P"],
-    first: NDArray[np.bool_],
 ) -> Iterator[Discovery]:
-    """Least squares on all terms, and on those that pruning leaves."""
+    """Least squares on a family of terms, and on those that pruning leaves."""
+    basis, first = narrow(basis, data, objective, known)
 
     def fit(part: MonomialBasis, held: Float[Array, " P"], last: Fit | None) -> Fit:
         make, windows = regress(part, data, objective)

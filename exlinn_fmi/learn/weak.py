@@ -127,6 +127,7 @@ def force_scale(data: Dataset) -> Float[Array, " n"]:
     """Units of the generalised forces: in each equation the force that has the power of the inputs."""
     _, v, _, force = data.arrays
     speed = np.sqrt(np.mean(v**2, axis=0))
+    speed = np.where(speed > 0, speed, speed.max() or 1.0)
     power = np.sqrt(np.mean(force**2, axis=0)) * speed
     return np.asarray(power.max() / speed)
 

@@ -166,7 +166,7 @@ def test_a_negative_mass_is_told() -> None:
 def test_true_terms_and_no_others_are_found_in_noise(level) -> None:
     data = noisy(level, seed=2)
     basis = candidates(data)
-    *_, found = discover(basis, data)
+    *_, found = discover(basis, None, data)
     assert set(np.array(basis.terms)[found.chosen]) == {*FAMILY.terms}
     assert found.p[[0, 1, 2, 3]] == pytest.approx(TRUE[:4], rel=level)
 
