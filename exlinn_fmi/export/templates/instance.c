@@ -178,6 +178,8 @@ static Status start(Instance *s)
     return OK;
 }
 
+#define MOST_STEPS 1e9 /* internal steps in a communication step: more are taken for a mistake */
+
 /* A communication step from t to t + h, or less if `between` says so. */
 static Status step(Instance *s, const char *function, double t, double h, double *end, Between *between)
 {
@@ -192,6 +194,10 @@ static Status step(Instance *s, const char *function, double t, double h, double
     if (t + h > s->state.stop_time + rounding) {
         return fail(s, "%s: a step from %.9g s to %.9g s goes past the stop time %.9g s", function, t, t + h,
                     s->state.stop_time);
+    }
+    if (s->state.values[SOLVER_TOLERANCE] == 0.0 && h / s->state.values[SOLVER_STEP] > MOST_STEPS) {
+        return fail(s, "%s: a step of %g s in internal steps of %g s is one of too many; make the parameter solver_step "
+                    "larger", function, h, s->state.values[SOLVER_STEP]);
     }
     *time = t; /* the importer's clock is the one that counts */
     const int bad = advance(&s->state, h, end, between, s);
