@@ -19,6 +19,7 @@ from exlinn_fmi import errors
 from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
 from exlinn_fmi.components.fmu import FmuComponent, FmuSettings, read_variables
 from exlinn_fmi.components.process import PATIENCE, LostError, Process
+from exlinn_fmi.components.texts import handle, text
 from exlinn_fmi.components.worker import (
     CALL,
     EXCHANGE,
@@ -31,6 +32,7 @@ from exlinn_fmi.components.worker import (
     REQUEST,
     STEP,
     STEPPING,
+    plain,
 )
 from exlinn_fmi.errors import ComponentError, ExlinnError
 
@@ -38,8 +40,8 @@ START = 60.0
 """Time that a process has to start [s]: on a busy machine this may be slow, whatever the component."""
 
 _STAGES = ("instantiation", "setting inputs", "reading outputs", "the step")
-_Slot = tuple[int, Values]
-"""Number of a set of variables, and where their values are in the shared block."""
+_Slot = tuple[int, Values, list[int]]
+"""Number of a set of variables, where their values are in the shared block, which of them are texts."""
 
 
 class IsolatedComponent(Component):
@@ -73,6 +75,9 @@ class IsolatedComponent(Component):
         self.name, self.variables = name, tuple(variables)
         self._slots: dict[tuple[bool, bytes], _Slot] = {}
         self._free = FIRST
+        self._texts = frozenset(k for k, v in enumerate(self.variables) if v.type in ("String", "Binary"))
+        self._theirs: dict[float, float] = {0.0: 0.0}  # number there of a text, by its number here
+        self._ours: dict[float, float] = {0.0: 0.0}  # the other way round
         self._pending = -1  # slot with inputs that are still to be set
         self._posted: float | None = None  # time of a step that may still be going on [s]
         self._carried = -1  # slot with the inputs that it took along
@@ -103,7 +108,8 @@ class IsolatedComponent(Component):
     ) -> Status:
         """As the component itself."""
         self._pending, self._undoable, self._time = -1, False, start_time
-        given = {name: float(value) for name, value in starts.items()}
+        texts = {self.variables[k].name for k in self._texts}
+        given = {n: self._sent(float(v)) if n in texts else float(v) for n, v in starts.items()}
         return self._status("enter_initialization", start_time, stop_time, given, what="initialisation")
 
     def exit_initialization(self) -> Status:
@@ -115,19 +121,24 @@ class IsolatedComponent(Component):
 
     def set(self, indices: Indices, values: Values) -> Status:
         """Lay values ready; they are set, and refused if they are, together with the call that comes next."""
-        number, place = self._slot(False, indices)
+        number, place, texts = self._slot(False, indices)
         status = Status.OK
         if self._pending not in (-1, number) or self._carried == number:
             status = self._settle()  # what lies there may not have been read yet
+        sent = [self._sent(float(values[k])) for k in texts]
         place[:] = values
+        if texts:
+            place[texts] = sent
         self._pending = number
         return status
 
     def get(self, indices: Indices, values: Values) -> Status:
         """As the component itself."""
-        number, place = self._slot(True, indices)
+        number, place, texts = self._slot(True, indices)
         status = self._exchange(EXCHANGE, number)
         values[:] = place
+        for k in texts:
+            values[k] = self._received(float(place[k]))
         return status
 
     def step(self, t: float, h: float) -> Status:
@@ -187,17 +198,31 @@ class IsolatedComponent(Component):
                 self._free = FIRST
             self._call("slot", self._free, indices.tolist(), full, what="laying out memory")
             place = self._process.block[self._free : self._free + len(indices)]
-            slot = self._slots[key] = (len(self._slots), place)
+            texts = [at for at, k in enumerate(indices.tolist()) if k in self._texts]
+            slot = self._slots[key] = (len(self._slots), place, texts)
             self._free += len(indices)
         return slot
+
+    def _sent(self, number: float) -> float:
+        """The number in the other process of a text that has a number in this one."""
+        if number not in self._theirs:
+            self._theirs[number] = self._call("keep", *plain(text(number)), what="passing on a text")
+        return self._theirs[number]
+
+    def _received(self, number: float) -> float:
+        """The number in this process of a text that has a number in the other one."""
+        if number not in self._ours:
+            content, binary = self._call("tell", number, what="passing on a text")
+            self._ours[number] = handle(bytes.fromhex(content) if binary else content)
+        return self._ours[number]
 
     def _exchange(self, kind: int, taken: int, t: float = 0.0, h: float = 0.0) -> Status:
         """Set what is still to be set, then step or read outputs into a slot."""
         self._send(REQUEST.pack(kind, self._pending, taken, 0, t, h))
         self._pending = -1
-        status, text = self._receive(_STAGES[2])
+        status, said = self._receive(_STAGES[2])
         if status:
-            self.message = text
+            self.message = said
         return Status(status)
 
     def _settle(self) -> Status:
@@ -210,9 +235,9 @@ class IsolatedComponent(Component):
 
     def _status(self, method: str, *arguments: Any, what: str) -> Status:
         """Call a method that gives a status."""
-        status, text = self._request(method, arguments, what)
+        status, said = self._request(method, arguments, what)
         if status:
-            self.message = text
+            self.message = said
         return Status(status)
 
     def _call(self, method: str, *arguments: Any, what: str) -> Any:
@@ -243,15 +268,15 @@ class IsolatedComponent(Component):
             if reply == FINE:
                 return Status.OK, ""
             status, length = REPLY.unpack(reply)
-            text = self._process.receive(length).decode() if length else ""
+            said = self._process.receive(length).decode() if length else ""
         except LostError as error:
             self._lost(error, what)
         if status < 0:
             word = f"the step ended with status {Status(-status).name}"
-            raise ComponentError(self.name, f"{word}: {text or 'no text'}", time=posted)
+            raise ComponentError(self.name, f"{word}: {said or 'no text'}", time=posted)
         if status == FAILED:
-            raise self._raised(**json.loads(text))
-        return status, text
+            raise self._raised(**json.loads(said))
+        return status, said
 
     def _lost(self, error: LostError, what: str) -> NoReturn:
         """Tell how the process ended, and in which call."""
@@ -262,13 +287,13 @@ class IsolatedComponent(Component):
         where = f" in {what}" if what else ""
         raise ComponentError(self.name, f"{error}{where}", time=None if math.isnan(time) else time) from None
 
-    def _raised(self, name: str, text: str) -> ExlinnError:
+    def _raised(self, name: str, said: str) -> ExlinnError:
         """An exception of the component as it would be in this process."""
         kind = getattr(errors, name, None)
         if kind is ComponentError or not (isinstance(kind, type) and issubclass(kind, ExlinnError)):
             prefix = "" if kind is ComponentError else f"{name}: "
-            return ComponentError(self.name, prefix + text.removeprefix(f"{self.name}: "))
-        return kind(text)
+            return ComponentError(self.name, prefix + said.removeprefix(f"{self.name}: "))
+        return kind(said)
 
 
 class _SavedState:

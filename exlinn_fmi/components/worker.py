@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values
+from exlinn_fmi.components.texts import handle, text
 
 REQUEST = struct.Struct("<iiiidd")
 """Kind, slot to set, slot to get, bytes that follow, t [s], h [s]; a slot is -1 where there is none."""
@@ -80,12 +81,12 @@ class Worker:
             elif kind == POST:
                 posted, said = self._exchange(kind, given, taken, t, h)
             else:
-                status, text = self._exchange(kind, given, taken, t, h)
+                status, words = self._exchange(kind, given, taken, t, h)
                 if posted > status:
-                    status, text = posted, said
+                    status, words = posted, said
                 posted = Status.OK
                 if status:
-                    self._reply(status, text)
+                    self._reply(status, words)
                 else:
                     os.write(self._replies, FINE)
 
@@ -119,8 +120,8 @@ class Worker:
             own = getattr(self, f"do_{method}", None)
             result = (own or getattr(self._component, method))(*arguments)
         except Exception as error:
-            text = json.dumps({"name": type(error).__name__, "text": str(error)})
-            self._reply(FAILED, text)
+            raised = json.dumps({"name": type(error).__name__, "said": str(error)})
+            self._reply(FAILED, raised)
         else:
             if isinstance(result, Status):
                 self._reply(result, self._component.message)
@@ -153,6 +154,14 @@ class Worker:
             self._slots.clear()
         self._slots.append((np.array(indices, dtype=np.intp), self._block[place : place + len(indices)]))
 
+    def do_keep(self, content: str, binary: bool) -> float:
+        """Number here of a text."""
+        return handle(bytes.fromhex(content) if binary else content)
+
+    def do_tell(self, number: float) -> tuple[str, bool]:
+        """The text that has a number here."""
+        return plain(text(number))
+
     def do_save_state(self) -> int:
         """Save the state; its number."""
         self._count += 1
@@ -179,11 +188,16 @@ class Worker:
             data += part
         return data
 
-    def _reply(self, status: int, text: str = "") -> None:
-        data = text.encode(errors="replace")
+    def _reply(self, status: int, words: str = "") -> None:
+        data = words.encode(errors="replace")
         data = REPLY.pack(status, len(data)) + data
         while data:
             data = data[os.write(self._replies, data) :]
+
+
+def plain(content: str | bytes) -> tuple[str, bool]:
+    """A text as JSON has it, a binary in hexadecimal digits; and whether it is one."""
+    return (content.hex(), True) if isinstance(content, bytes) else (content, False)
 
 
 def watch_parent(requests: int) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from fmu_helpers import TYPES_3, Driver, probe
 
-from exlinn_fmi.components import process, worker
+from exlinn_fmi.components import process, texts, worker
 from exlinn_fmi.components.base import Component, Status, Variable
 from exlinn_fmi.components.fmu import FmuComponent
 from exlinn_fmi.components.isolated import IsolatedComponent, isolated_fmu
@@ -174,6 +174,44 @@ def test_any_component_can_be_isolated_and_its_exceptions_are_told() -> None:
         ComponentError, match=r"^stubborn at t = 0 s: the step ended with status ERROR: .*no more"
     ):
         driver.get("y")
+    component.close()
+
+
+class Backwards(PythonComponent):
+    """Texts and binaries turned round; other numbers stand for them in this process than in its own."""
+
+    def __init__(self, name: str) -> None:
+        texts.handle(f"only here: {os.getpid()}")
+        kinds = ("String", "Binary")
+        inputs = [Variable(f"{kind}_in", "input", "discrete", type=kind, start=0.0) for kind in kinds]
+        outputs = [Variable(f"{kind}_out", "output", "discrete", type=kind) for kind in kinds]
+        super().__init__(name, [*inputs, *outputs, Variable("pid", "output", "discrete")])
+
+    def outputs(self, t: float) -> None:
+        for kind in ("String", "Binary"):
+            self[f"{kind}_out"] = texts.handle(texts.text(self[f"{kind}_in"])[::-1])
+        self["pid"] = os.getpid()
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_texts_mean_the_same_in_both_processes(apart: bool, request: pytest.FixtureRequest) -> None:
+    if not apart:
+        request.getfixturevalue("within")
+    made = Backwards("b")
+    for k in range(5):
+        texts.handle(f"{k} {time.monotonic()}")  # numbers that the other process does not have
+    component = IsolatedComponent("b", made.variables, f"{__name__}:Backwards", {"name": "b"})
+    driver = Driver(component).begin()
+    assert (driver.get("pid") == [os.getpid()]) != apart
+    for word in ("Motor", "läuft", "", "Motor"):
+        driver.set(String_in=texts.handle(word), Binary_in=texts.handle(word.encode()))
+        assert [texts.text(n) for n in driver.get("String_out", "Binary_out")] == [
+            word[::-1],
+            word.encode()[::-1],
+        ]
+        driver.step()
+    driver.begin(String_in=texts.handle("again"))
+    assert texts.text(driver.get("String_out")[0]) == "niaga"
     component.close()
 
 
