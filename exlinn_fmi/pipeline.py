@@ -166,6 +166,7 @@ def simulate(work: Run, resume: bool = False) -> None:
     if work.unchanged("simulate", key, detail):
         return
     from exlinn_fmi.components.events import MONITOR, with_events
+    from exlinn_fmi.components.links import with_links
     from exlinn_fmi.results.metrics import control_metrics
 
     began = time.perf_counter()
@@ -176,6 +177,7 @@ def simulate(work: Run, resume: bool = False) -> None:
     if scenario.events:
         components = with_events(components, scenario.events, scenario.seed, span.step)
         span = span.model_copy(update={"record": [*span.record, f"{MONITOR}.*"]})
+    components = with_links(components, scenario.links())
     starts = {name: spec.start for name, spec in scenario.components.items()}
     store = store_of(work, span, key, resume)
     result = cosimulate(work, components, scenario.connection_list(), span, starts, store)

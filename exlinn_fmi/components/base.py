@@ -43,6 +43,21 @@ class Status(IntEnum):
 
 
 @dataclass(frozen=True)
+class SiUnit:
+    """A unit in terms of SI base units: value in SI = factor · value + offset (FMI 2.0 §2.2.2).
+
+    Args:
+        powers: exponents of kg, m, s, A, K, mol, cd, rad.
+        factor: see above.
+        offset: see above.
+    """
+
+    powers: tuple[int, int, int, int, int, int, int, int]
+    factor: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
 class Variable:
     """One variable of a component.
 
@@ -58,6 +73,7 @@ class Variable:
         depends_on: for an output, the inputs it depends on directly; None where the component does not say.
         min: least value that makes sense, None where the component states none.
         max: greatest value that makes sense, None where the component states none.
+        si: what the unit is in SI base units, None where the component does not define it.
     """
 
     name: str
@@ -70,6 +86,7 @@ class Variable:
     depends_on: tuple[str, ...] | None = ()
     min: float | None = None
     max: float | None = None
+    si: SiUnit | None = None
 
 
 class Component(ABC):

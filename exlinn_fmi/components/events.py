@@ -17,6 +17,7 @@ from hashlib import blake2b
 import numpy as np
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
+from exlinn_fmi.components.wrapper import Wrapper
 from exlinn_fmi.scenario.events import Event, event_names
 
 MONITOR = "events"
@@ -137,7 +138,7 @@ class Effect:
         return first + (second - first) * (then - t0) / (t1 - t0)
 
 
-class Touched(Component):
+class Touched(Wrapper):
     """A component to which events happen, or one of whose variables an event waits for.
 
     Args:
@@ -146,8 +147,8 @@ class Touched(Component):
     """
 
     def __init__(self, inner: Component, schedule: Schedule) -> None:
-        self.name, self.variables, self.warnings = inner.name, inner.variables, inner.warnings
-        self._inner, self._schedule = inner, schedule
+        super().__init__(inner)
+        self._schedule = schedule
         places = {variable.name: k for k, variable in enumerate(inner.variables)}
         self._effects: dict[int, list[Effect]] = {}
         self._freezing: list[int] = []
@@ -168,42 +169,23 @@ class Touched(Component):
         self._time = self._lag = 0.0
         self._arrived = -math.inf
 
-    @property
-    def message(self) -> str:  # type: ignore[override]  # the contract has a plain attribute
-        """What the inner component last said."""
-        return self._inner.message
-
-    @property
-    def sampled(self) -> bool:
-        """As the inner component."""
-        return self._inner.sampled
-
-    @property
-    def can_save_state(self) -> bool:
-        """As the inner component."""
-        return self._inner.can_save_state
-
     def enter_initialization(
         self, start_time: float, stop_time: float, starts: Mapping[str, float]
     ) -> Status:
         """As the inner component; what it starts with is noted."""
-        status = self._inner.enter_initialization(start_time, stop_time, starts)
+        status = self.inner.enter_initialization(start_time, stop_time, starts)
         self._schedule.restart()
         self._time, self._lag, self._arrived = start_time, 0.0, -math.inf
         for place, effects in self._effects.items():
             self._effects[place] = [Effect(self._schedule, e._k, e._smooth) for e in effects]
         if self._own and status < Status.DISCARD:
             values = np.zeros(len(self._own))
-            status = max(status, self._inner.get(np.array(self._own, dtype=np.intp), values))
+            status = max(status, self.inner.get(np.array(self._own, dtype=np.intp), values))
             self._given = dict(zip(self._own, values.tolist(), strict=True))
             for place in self._own:
                 for effect in self._effects[place]:
                     effect.start = self._given[place]
         return status
-
-    def exit_initialization(self) -> Status:
-        """As the inner component."""
-        return self._inner.exit_initialization()
 
     def set(self, indices: Indices, values: Values) -> Status:
         """Set what comes of the values, which are changed in place; nothing while the component is frozen."""
@@ -214,12 +196,12 @@ class Touched(Component):
             self._connected.add(place)
             self._given[place] = float(values[position])
             values[position] = self._applied(place, values[position])
-        return max(status, self._inner.set(indices, values))
+        return max(status, self.inner.set(indices, values))
 
     def get(self, indices: Indices, values: Values) -> Status:
         """Read, and change what the events are about."""
         status = Status.OK if self._frozen() else self._arrive()
-        status = max(status, self._inner.get(indices, values))
+        status = max(status, self.inner.get(indices, values))
         for position, place in self._touched(indices):
             if place not in self._given:
                 values[position] = self._applied(place, values[position])
@@ -236,7 +218,7 @@ class Touched(Component):
         if self._frozen():
             self._lag += h
         else:
-            status = max(status, self._arrive(), self._inner.step(t - self._lag, h))
+            status = max(status, self._arrive(), self.inner.step(t - self._lag, h))
         self._time = t + h
         return status
 
@@ -244,18 +226,14 @@ class Touched(Component):
         """The inner component's state and what the effects remember."""
         kept = {name: getattr(self, name) for name in ("_effects", "_given", "_time", "_lag", "_arrived")}
         memory = {id(self._schedule): self._schedule}  # shared, so not copied
-        return self._inner.save_state(), copy.deepcopy(kept, memory), list(self._schedule.begins)
+        return self.inner.save_state(), copy.deepcopy(kept, memory), list(self._schedule.begins)
 
     def restore_state(self, state: object) -> None:
         """Go back to a state that `save_state` returned."""
         assert isinstance(state, tuple)
         inner, kept, self._schedule.begins[:] = state
-        self._inner.restore_state(inner)
+        self.inner.restore_state(inner)
         self.__dict__.update(copy.deepcopy(kept, {id(self._schedule): self._schedule}))
-
-    def close(self) -> None:
-        """Close the inner component."""
-        self._inner.close()
 
     def _frozen(self) -> bool:
         return any(self._schedule.active(k, self._time) for k in self._freezing)
@@ -267,7 +245,7 @@ class Touched(Component):
         if not places:
             return Status.OK
         values = np.array([self._applied(place, self._given[place]) for place in places])
-        return self._inner.set(np.array(places, dtype=np.intp), values)
+        return self.inner.set(np.array(places, dtype=np.intp), values)
 
     def _applied(self, place: int, value: float) -> float:
         for effect in self._effects[place]:

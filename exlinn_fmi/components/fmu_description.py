@@ -11,14 +11,14 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
 
 import fmpy
 
-from exlinn_fmi.components.base import Causality, Variability, Variable, VariableType
+from exlinn_fmi.components.base import Causality, SiUnit, Variability, Variable, VariableType
 from exlinn_fmi.components.texts import handle
 from exlinn_fmi.errors import FmuError
 
@@ -31,6 +31,7 @@ MOST_ELEMENTS = 1_000_000
 _Key = tuple[str, int]
 """Accessor and value reference of a variable."""
 
+_SI_BASES = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 _INTEGERS = ("Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64")
 _TYPES: dict[str, VariableType] = {
     "Real": "Real",
@@ -338,7 +339,7 @@ def _parts(
     Raises:
         FmuError: a start value or range is no number, or arrays are too large.
     """
-    total = 0
+    total, units = 0, _units(root)
     texts = {
         e.get("name"): [s.get("value") or "" for s in e.findall("Start")]
         for tag in ("String", "Binary")
@@ -357,7 +358,7 @@ def _parts(
                 starts = starts * size if len(starts) == 1 else [None] * size
             if v.causality == "structuralParameter":
                 starts = [structure[v.name]]
-            one = _variable(v)
+            one = _variable(v, units)
         except ValueError as error:
             raise FmuError(f"{path}: variable {v.name!r} (line {v.sourceline}): {error}") from error
         for k, place in enumerate(itertools.product(*(range(1, n + 1) for n in shape))):
@@ -373,8 +374,28 @@ def _start(v: Any, text: str | None) -> float | None:
     return handle(bytes.fromhex(text)) if v.type == "Binary" else _number(text)
 
 
-def _variable(v: Any) -> Any:
+def _units(root: ElementTree.Element) -> dict[str, SiUnit]:
+    """The units that the FMU defines in SI base units, by name.
+
+    Raises:
+        ValueError: an exponent, factor or offset is no number.
+    """
+    found = {}
+    for unit in root.iterfind("UnitDefinitions/Unit"):
+        base = unit.find("BaseUnit")
+        if base is not None:
+            kg, m, s, A, K, mol, cd, rad = (int(base.get(name, "0")) for name in _SI_BASES)
+            factor, offset = float(base.get("factor", "1")), float(base.get("offset", "0"))
+            found[unit.get("name", "")] = SiUnit((kg, m, s, A, K, mol, cd, rad), factor, offset)
+    return found
+
+
+def _variable(v: Any, units: Mapping[str, SiUnit]) -> Any:
     """What makes a variable of a name and a start value, all else as the description has it.
+
+    Args:
+        v: FMPy's variable.
+        units: definitions of units by name.
 
     Raises:
         ValueError: its range is no number.
@@ -393,6 +414,9 @@ def _variable(v: Any) -> Any:
         items = [int(item.value) for item in declared.items]
         low, high = min(items), max(items)
     unit = v.unit or getattr(declared, "unit", None)
+    si = units.get(unit or "")
+    if si is not None and si.offset and (v.relativeQuantity or getattr(declared, "relativeQuantity", None)):
+        si = replace(si, offset=0.0)  # a difference of temperatures
     least, most = _number(low), _number(high)
 
     def make(name: str, start: float | None) -> Variable:
@@ -406,6 +430,7 @@ def _variable(v: Any) -> Any:
             description=v.description or "",
             min=least,
             max=most,
+            si=si,
         )
 
     return make

@@ -9,8 +9,9 @@ from exlinn_fmi.components.base import Variable
 from exlinn_fmi.components.starts import takes_start, value_problem
 from exlinn_fmi.scenario.explain import Finding
 from exlinn_fmi.scenario.learning import LearnFromData
+from exlinn_fmi.scenario.schema import Link
 from exlinn_fmi.scenario.survey import Survey
-from exlinn_fmi.scenario.units import same_unit
+from exlinn_fmi.scenario.units import linear
 from exlinn_fmi.scenario.words import KeyPath, suggestion
 
 _FITS = {("Integer", "Enumeration"), ("Enumeration", "Integer"), ("Boolean", "Integer")}
@@ -43,8 +44,10 @@ def connections(survey: Survey) -> Iterator[Finding]:
         if problem:
             yield at, problem
         several = isinstance(targets, list)
-        for k, target in enumerate(targets if isinstance(targets, list) else [targets]):
+        for k, entry in enumerate(targets if isinstance(targets, list) else [targets]):
             here = (*at, k) if several else at
+            link = entry if isinstance(entry, Link) else None
+            target = entry if isinstance(entry, str) else entry.to
             head, problem = survey.find(target, "input")
             if problem:
                 yield here, problem
@@ -52,11 +55,16 @@ def connections(survey: Survey) -> Iterator[Finding]:
                 yield here, f"{target} is driven twice, by {driven[target]} and by {source}; keep one"
             driven.setdefault(target, source)
             if tail is not None and head is not None:
-                yield from ((here, message) for message in _misfits(source, tail, target, head))
+                yield from ((here, message) for message in _misfits(source, tail, target, head, link))
 
 
-def _misfits(source: str, tail: Variable, target: str, head: Variable) -> Iterator[str]:
+def _misfits(source: str, tail: Variable, target: str, head: Variable, link: Link | None) -> Iterator[str]:
     """Why one variable cannot drive another."""
+    converts = link is None or link.convert
+    factor, offset = (linear(tail, head) if converts else None) or (1.0, 0.0)
+    changes = (factor, offset) != (1.0, 0.0) or (
+        link is not None and (link.factor, link.offset) != (1.0, 0.0)
+    )
     if tail.causality == "input" and head.causality == "output":
         yield f"{source} is an input and {target} an output; a connection reads from: to, so swap them"
         return
@@ -68,8 +76,10 @@ def _misfits(source: str, tail: Variable, target: str, head: Variable) -> Iterat
     elif head.causality not in ("input", "parameter"):
         kind = "an output" if head.causality == "output" else "no input"
         yield f"{target} is {kind}; a connection ends at an input"
-    elif not same_unit(tail.unit, head.unit):
+    elif converts and linear(tail, head) is None:
         yield f"unit mismatch: {source} [{tail.unit}] → {target} [{head.unit}]"
+    elif changes and head.type != "Real":
+        yield f"{target} is of type {head.type}, and the connection changes the value"
     elif head.type not in ("Real", tail.type) and (tail.type, head.type) not in _FITS:
         yield f"type mismatch: {source} is {tail.type}, {target} is {head.type}"
 

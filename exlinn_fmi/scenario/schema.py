@@ -151,6 +151,26 @@ class Metrics(Spec):
         return self.output if isinstance(self.output, list) else [self.output] if self.output else []
 
 
+class Link(Spec):
+    """A connection that changes the value: ``factor · value + offset``, after its unit is converted."""
+
+    to: VariablePath = Field(description="where the connection leads, component.variable")
+    factor: float = Field(1.0, description="what the value is multiplied by")
+    offset: float = Field(0.0, description="what is added then, in the unit of the target")
+    convert: bool = Field(True, description="whether the value is converted to the target's unit before")
+
+
+Target = Annotated[
+    Annotated[VariablePath, Tag("text")] | Annotated[Link, Tag("a mapping")], Discriminator(form)
+]
+Targets = Annotated[
+    Annotated[VariablePath, Tag("text")]
+    | Annotated[Link, Tag("a mapping")]
+    | Annotated[list[Target], Tag("a list")],
+    Discriminator(form),
+]
+
+
 class Scenario(Spec):
     """One experiment: components, how they are connected, and what is done with them."""
 
@@ -162,8 +182,9 @@ class Scenario(Spec):
     components: dict[Name, ComponentSpec] = Field(
         default_factory=dict, description="what takes part, by name"
     )
-    connections: dict[VariablePath, Paths] = Field(
-        default_factory=dict, description="from: to, or from: [to, to], each component.variable"
+    connections: dict[VariablePath, Targets] = Field(
+        default_factory=dict,
+        description="from: to, or from: [to, to], each component.variable or {to, factor, offset}",
     )
     events: list[Event] = Field(
         default_factory=list, description="what happens to signals, parameters and components during a run"
@@ -185,10 +206,14 @@ class Scenario(Spec):
         """
         return any(file.resolve().is_relative_to((folder / place).resolve()) for place in (".", *self.trust))
 
-    def connection_list(self) -> list[tuple[str, str]]:
-        """All connections as (from, to)."""
+    def links(self) -> list[tuple[str, Link]]:
+        """All connections as (from, connection)."""
         return [
-            (source, target)
+            (source, target if isinstance(target, Link) else Link(to=target))
             for source, targets in self.connections.items()
             for target in (targets if isinstance(targets, list) else [targets])
         ]
+
+    def connection_list(self) -> list[tuple[str, str]]:
+        """All connections as (from, to)."""
+        return [(source, link.to) for source, link in self.links()]

@@ -171,7 +171,7 @@ def test_the_text_of_the_error_lists_file_line_path_and_count(tmp_path):
             "  ctl.v: plant",
             "expected a variable as component.variable, found text 'plant'",
         ),
-        ("  ctl.v: plant.v", "  ctl.v: {a: 1}", "expected text or a list, found a mapping"),
+        ("  ctl.v: plant.v", "  ctl.v: 1", "expected text, a mapping or a list, found 1"),
         (
             "preset: paper",
             "preset: papers",

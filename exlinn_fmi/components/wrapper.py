@@ -1,0 +1,68 @@
+"""A component around another that passes every call on; who changes something overrides that alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from exlinn_fmi.components.base import Component, Indices, Status, Values
+
+
+class Wrapper(Component):
+    """A component that is as the one within.
+
+    Args:
+        inner: the component that does the work.
+    """
+
+    def __init__(self, inner: Component) -> None:
+        self.name, self.variables, self.warnings = inner.name, inner.variables, inner.warnings
+        self.inner = inner
+
+    @property
+    def message(self) -> str:  # type: ignore[override]  # the contract has a plain attribute
+        """What the inner component last said."""
+        return self.inner.message
+
+    @property
+    def sampled(self) -> bool:
+        """As the inner component."""
+        return self.inner.sampled
+
+    @property
+    def can_save_state(self) -> bool:
+        """As the inner component."""
+        return self.inner.can_save_state
+
+    def enter_initialization(
+        self, start_time: float, stop_time: float, starts: Mapping[str, float]
+    ) -> Status:
+        """As the inner component."""
+        return self.inner.enter_initialization(start_time, stop_time, starts)
+
+    def exit_initialization(self) -> Status:
+        """As the inner component."""
+        return self.inner.exit_initialization()
+
+    def set(self, indices: Indices, values: Values) -> Status:
+        """As the inner component."""
+        return self.inner.set(indices, values)
+
+    def get(self, indices: Indices, values: Values) -> Status:
+        """As the inner component."""
+        return self.inner.get(indices, values)
+
+    def step(self, t: float, h: float) -> Status:
+        """As the inner component."""
+        return self.inner.step(t, h)
+
+    def save_state(self) -> object:
+        """As the inner component."""
+        return self.inner.save_state()
+
+    def restore_state(self, state: object) -> None:
+        """As the inner component."""
+        self.inner.restore_state(state)
+
+    def close(self) -> None:
+        """Close the inner component."""
+        self.inner.close()
