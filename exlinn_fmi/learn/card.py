@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.learn.estimate import estimate
+from exlinn_fmi.learn.guarantee import told
 from exlinn_fmi.learn.identify import Identified, identify
 from exlinn_fmi.learn.noise import CLEAN, relative_noise
 from exlinn_fmi.learn.rollout import free_run, nrmse
@@ -42,8 +43,9 @@ class ReportCard:
         evaluation: on the first test: time, and each quantity measured (``name``) and learned
             (``name_learned``).
         units: units of the evaluation's columns.
-        texts: ``learn.objective``, ``learn.terms`` and ``identify.objective``: what was done and why, and the
-            formula that was found, as far as there is any.
+        texts: ``learn.guarantee``: whether bounded inputs keep the model bounded; ``learn.objective``,
+            ``learn.terms`` and ``identify.objective``: what was done and why, and the formula that was found,
+            as far as there is any.
         terms: the terms that were found, if the model is made of such.
     """
 
@@ -86,7 +88,7 @@ def report_card(
     }
     noise = relative_noise(train)
     metrics |= {f"learn.noise_{name}": value for name, value in noise.items()}
-    found, texts = None, {}
+    found, texts = None, {"learn.guarantee": told(system, train)}
     if options.names and (objective != "auto" or max(noise.values()) > CLEAN):
         found, texts["identify.objective"] = estimate(train, options, truth, objective)
     found = found or identify(system, train, options, truth)

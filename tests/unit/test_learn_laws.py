@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset, split
 from exlinn_fmi.learn.card import force_error
+from exlinn_fmi.learn.guarantee import KEPT, doubts, told
 from exlinn_fmi.learn.identify import identify
 from exlinn_fmi.learn.rollout import free_run, nrmse
 from exlinn_fmi.learn.train import TrainedModel, train
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
 from exlinn_fmi.mechanics.learned import FAITHFUL, ModelSpec, Weights, learned_system
+from exlinn_fmi.mechanics.monomials import MonomialBasis
 from exlinn_fmi.scenario.learning import Identify, Structured
 from tests.learn_helpers import MOTOR_CART, SOLENOID, motor_cart, random_model, solenoid_dataset
 
@@ -145,6 +147,90 @@ def test_a_potential_that_falls_ever_steeper_leads_nowhere() -> None:
     weights = {**drawn, "lagrangian.output": output, "dissipation.viscous": np.ones(1)}
     assert (spec.layout.outputs[-1], spec.layout.products[1]) == (("V", 0, 0), (0, 0, 0))
     assert_bounded(spec, weights, 0)
+
+
+# ── terms: what is guaranteed is kept, what is not is said ───────────────────────────────────────────────
+
+SHAPES = {
+    "circle": ("-1*cos({q})", "0.1*sin({q})^2*{v}^2", "0.2*cos({q})*{v}^2"),
+    "line": ("-0.3*{q}^2", "-0.1*{q}^4", "0.2*lorentz(2*{q})*{v}^2"),
+}
+
+
+def random_terms(seed: int, topology: str) -> tuple[LagrangianSystem, Dataset]:
+    """A sum of terms with coefficients drawn at random, some of them wrong, and data of its range."""
+    random = np.random.default_rng(seed)
+    coordinates = (
+        Coordinate("q", "rad" if topology == "circle" else "m", topology=topology, input="f"),
+        Coordinate("Q", "C", "electrical", "cyclic", "i", "A", input="v", input_unit="V"),
+    )
+    lagrangian = ["0.5*q_dot^2", "0.5*i^2", "q*i", *(t.format(q="q", v="q_dot") for t in SHAPES[topology])]
+    dissipation = ["0.5*q_dot^2", "0.2*logcosh(5*q_dot)", "abs(q_dot)^3", "0.5*i^2"]
+    p = random.uniform(-0.3, 1.5, len(lagrangian) + len(dissipation))
+    rows = 200
+    names = ["q", "q_dot", "i", "q_ddot", "i_dot", "f", "v"]
+    frame = pd.DataFrame(random.uniform(-1, 1, (rows, len(names))), columns=names)
+    frame.insert(0, "time", np.arange(rows) * 0.01)
+    frame.insert(0, "trajectory", 0)
+    system = MonomialBasis(coordinates, tuple(lagrangian), tuple(dissipation)).system().bound(p)
+    return system, Dataset(frame, coordinates)
+
+
+@pytest.mark.parametrize("topology", SHAPES)
+def test_sums_of_terms_without_doubts_stay_bounded_under_bounded_inputs(topology: str) -> None:
+    kept = 0
+    for seed in range(40):
+        system, data = random_terms(seed, topology)
+        if kept == 4 or doubts(system, data):
+            continue
+        kept += 1
+        inputs = np.random.default_rng(seed).uniform(-1, 1, (int(SECONDS / HOLD), 2))
+        inputs[: len(inputs) // 4] = 1
+        around = np.column_stack([np.linspace(-4, 4, 81), np.zeros(81)])
+        step = min(5e-3, 0.5 / fastest(system, around, np.array([5.0, 5.0])))
+        states, energy = energies_of_long_run(system, step, inputs, np.zeros(3))
+        assert np.isfinite(states).all()
+        # A circle has a potential of no account, and b q̇ ≤ 1 + k i; a line is held by its V.
+        second = energy[len(energy) // 2 :]
+        assert second.max() <= 1.5 * energy[: len(energy) // 2].max() + 1
+    assert kept >= 3
+
+
+@pytest.mark.parametrize(
+    ("lagrangian", "dissipation", "reason"),
+    [
+        (["0.5*q_dot^2", "cos(q)*q_dot^2"], ["q_dot^2"], "M is not positive definite at q = "),
+        (["0.5*q_dot^2"], ["logcosh(q_dot)"], "q_dot has no viscous friction"),
+        (["0.5*q_dot^2"], ["q_dot^2", "-1*abs(q_dot)"], "friction pushes at some speeds"),
+        (["0.5*q_dot^2", "q_dot^4"], ["q_dot^2"], "M depends on velocities"),
+        (["0.5*x_dot^2", "x^3"], ["x_dot^2"], "V falls without bound along a line"),
+        (["0.5*x_dot^2", "0.5*x^2*x_dot^2"], ["x_dot^2"], "M grows without bound along a line"),
+    ],
+)
+def test_the_card_says_why_a_model_might_not_stay_bounded(lagrangian, dissipation, reason) -> None:
+    line = "x_dot" in lagrangian[0]
+    name = "x" if line else "q"
+    coordinates = (
+        Coordinate(name, "m" if line else "rad", topology="line" if line else "circle", input="f"),
+    )
+    system = (
+        MonomialBasis(coordinates, tuple(lagrangian), tuple(dissipation))
+        .system()
+        .bound(np.ones(len(lagrangian) + len(dissipation)))
+    )
+    values = np.random.default_rng(0).uniform(-1, 1, (30, 4))
+    frame = pd.DataFrame(values, columns=[name, f"{name}_dot", f"{name}_ddot", "f"])
+    frame.insert(0, "time", np.arange(30) * 0.01)
+    frame.insert(0, "trajectory", 0)
+    assert any(text.startswith(reason) for text in doubts(system, Dataset(frame, coordinates)))
+
+
+def test_structured_models_give_no_doubts() -> None:
+    for seed in range(3):
+        spec, drawn = random_model(seed, KINDS["motor"])
+        viscous = drawn["dissipation.viscous"]
+        weights = {**drawn, "dissipation.viscous": viscous + 0.3 * np.sign(viscous)}
+        assert told(learned_system(spec, weights), Dataset(motor_cart(), MOTOR_CART)) == KEPT
 
 
 # ── units ────────────────────────────────────────────────────────────────────────────────────────────────
