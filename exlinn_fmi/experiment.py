@@ -32,6 +32,8 @@ def cosimulate(
     store: Store | None = None,
 ) -> Trajectories:
     """Step components in lockstep over `span`, with progress and Ctrl-C minded."""
+    from exlinn_fmi.cosim.adaptive import AdaptiveOptions
+    from exlinn_fmi.cosim.extrapolation import ExtrapolationOptions
     from exlinn_fmi.cosim.graph import Graph
     from exlinn_fmi.cosim.loops import LoopOptions
     from exlinn_fmi.cosim.master import Master
@@ -50,6 +52,8 @@ def cosimulate(
         span.record,
         record_every=span.record_every,
         loops=LoopOptions(**loops.model_dump()) if loops else None,
+        extrapolation=ExtrapolationOptions(**span.extrapolation.model_dump()) if span.extrapolation else None,
+        adaptive=AdaptiveOptions(**span.adaptive.model_dump()) if span.adaptive else None,
     )
     report = lambda part, t: work.reporter.update(part, f"t = {t:.3f} s")  # noqa: E731
     return master.run(starts, report, work.stop, store, span.pace)

@@ -22,6 +22,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from exlinn_fmi.components.base import Component
+from exlinn_fmi.cosim.adaptive import Adaptive, AdaptiveOptions
+from exlinn_fmi.cosim.extrapolation import ExtrapolationOptions
 from exlinn_fmi.cosim.graph import Graph
 from exlinn_fmi.cosim.loops import SOLVERS, LoopOptions
 from exlinn_fmi.cosim.pace import Pace
@@ -49,11 +51,13 @@ class Trajectories:
             store that is too long for the memory, every n-th.
         units: unit by column, where one is known.
         error: why the run ended early, None where it did not; the rows until then are in `frame`.
-        statistics: ``stepping`` (``plain`` or ``compiled``), ``steps`` (number done), ``seconds`` (wall
-            time), ``real_time_factor`` (simulated over wall time), ``warnings`` (by component: ``count`` and
-            text of the ``first``) and, where asked for, ``component_seconds`` (by component); ``loop_passes``
-            and ``loop_residual`` (their number, the worst accepted) where algebraic loops are solved;
-            ``missed_deadlines``, ``worst_delay`` and ``first_delay_at`` [s] of a run that is paced.
+        statistics: ``stepping`` (``plain``, ``compiled`` or ``adaptive``), ``steps`` (number done),
+            ``seconds`` (wall time), ``real_time_factor`` (simulated over wall time), ``warnings`` (by
+            component: ``count`` and text of the ``first``) and, where asked for, ``component_seconds`` (by
+            component); ``loop_passes`` and ``loop_residual`` (their number, the worst accepted) where
+            algebraic loops are solved; ``missed_deadlines``, ``worst_delay`` and ``first_delay_at`` [s] of a
+            run that is paced; ``communication_steps``, ``rejected_steps``, ``inexact_steps`` (kept in spite
+            of their error) and ``shortest_step`` [s] where steps are adaptive.
         rows: all rows, where the run has a store.
     """
 
@@ -79,6 +83,8 @@ class Master:
         compiled: whether to step in compiled code what offers its C functions; by default, where it pays.
         record_every: a row is recorded at every so many communication points.
         loops: how algebraic loops are solved; without it each is broken by a delay of one step.
+        extrapolation: how inputs go on over a step; without it they are held.
+        adaptive: how exact communication steps must be; `step` is the longest then.
 
     Raises:
         InputError: times do not fit together, or `record` names what is not there.
@@ -97,6 +103,8 @@ class Master:
         compiled: bool | None = None,
         record_every: int = 1,
         loops: LoopOptions | None = None,
+        extrapolation: ExtrapolationOptions | None = None,
+        adaptive: AdaptiveOptions | None = None,
     ) -> None:
         self.graph, self.start, self.stop, self.step = graph, start, stop, step
         self.ticks = count_ticks(start, stop, step)
@@ -115,7 +123,9 @@ class Master:
         if record_every < 1:
             raise InputError(f"record_every: expected a whole number of at least 1, found {record_every}")
         self._profile, self._compiled, self._every = profile, compiled, record_every
-        self._loops = loops
+        self._loops, self._extrapolation, self._adaptive = loops, extrapolation, adaptive
+        if adaptive is not None:
+            select(graph.components, adaptive.tolerances)
         self._stepper: Stepper | None = None
 
     def run(
@@ -162,6 +172,7 @@ class Master:
                 self.step,
                 self._seidel,
                 self._loops,
+                self._extrapolation,
             )
             error = self._attempt(plan, recorder, starts, watch) or _flush(recorder)
         finally:
@@ -218,11 +229,12 @@ class Master:
             k = saved["tick"]
             plan.restore(saved["plan"])
             recorder.go_on(saved["rows"])
-        stepper = make_stepper(plan, recorder, self.start, self.step, self._profile, self._compiled)
-        self._stepper = stepper
+        stepper = self._stepper = self._make_stepper(plan, recorder)
+        if saved is not None:
+            stepper.restore(saved["stepper"])
 
         def state() -> tuple[dict[str, Any], Recorder]:
-            return {"tick": k, "plan": plan.save()}, recorder
+            return {"tick": k, "plan": plan.save(), "stepper": stepper.save()}, recorder
 
         while watch.goes_on(k, ticks, self.start + k * self.step, state):
             chunk = stepper.chunk if watch.pace is None else 1
@@ -230,22 +242,23 @@ class Master:
             stepper.run(k, until)
             k = until
 
+    def _make_stepper(self, plan: Plan, recorder: Recorder) -> Stepper:
+        if self._adaptive is not None:
+            return Adaptive(plan, recorder, self.start, self.step, self._adaptive)
+        return make_stepper(plan, recorder, self.start, self.step, self._profile, self._compiled)
+
     def _statistics(self, plan: Plan, recorder: Recorder, watch: Watch) -> dict[str, Any]:
-        steps = max(recorder.rows - 1, 0) * self._every
-        loops = plan.loops
-        solved = {} if loops is None else {"loop_passes": loops.passes, "loop_residual": loops.worst}
-        seconds = watch.seconds
-        return (
-            solved
-            | watch.report()
-            | {
-                "stepping": "plain" if self._stepper is None else type(self._stepper).__name__.lower(),
-                "steps": steps,
-                "seconds": seconds,
-                "real_time_factor": steps * self.step / seconds,
-                "warnings": {name: asdict(warned) for name, warned in plan.warnings.items()},
-            }
-        )
+        steps, seconds, loops = max(recorder.rows - 1, 0) * self._every, watch.seconds, plan.loops
+        return {
+            "stepping": "plain" if self._stepper is None else type(self._stepper).__name__.lower(),
+            "steps": steps,
+            "seconds": seconds,
+            "real_time_factor": steps * self.step / seconds,
+            "warnings": {name: asdict(warned) for name, warned in plan.warnings.items()},
+            **({} if self._stepper is None else self._stepper.report()),
+            **({} if loops is None else {"loop_passes": loops.passes, "loop_residual": loops.worst}),
+            **watch.report(),
+        }
 
 
 # ── checks and closing ───────────────────────────────────────────────────────────────────────────────────

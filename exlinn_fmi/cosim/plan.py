@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values
+from exlinn_fmi.cosim.extrapolation import Extrapolation, ExtrapolationOptions
 from exlinn_fmi.cosim.graph import Graph
 from exlinn_fmi.cosim.loops import LoopOptions, Loops
 from exlinn_fmi.cosim.order import Port
@@ -91,9 +92,11 @@ class Plan:
         every: own step in ticks, by component number.
         ticks: number of the last tick.
         loops: the algebraic loops, where they are solved.
+        extrapolation: the inputs that are extrapolated, where they are.
         step: step of the master [s].
         gauss_seidel: whether inputs are refreshed from components already stepped.
         loops: how algebraic loops are solved; without it they are broken by delays.
+        extrapolation: how inputs go on over a step; without it they are held.
 
     Attributes:
         signals: the time, and the value of every variable that is passed on or recorded.
@@ -103,6 +106,7 @@ class Plan:
         hold_to, hold_from: places in `signals` of delayed values, and of what they are next.
         ticks: number of the last tick.
         loops: the algebraic loops, where they are solved.
+        extrapolation: the inputs that are extrapolated, where they are.
         columns: where time and recorded variables are in `signals`.
         warnings: by component name.
     """
@@ -117,6 +121,7 @@ class Plan:
         step: float,
         gauss_seidel: bool,
         loops: LoopOptions | None = None,
+        extrapolation: ExtrapolationOptions | None = None,
     ) -> None:
         self.graph, self.components = graph, tuple(components)
         self.warnings: dict[str, Warned] = {}
@@ -128,6 +133,11 @@ class Plan:
         ]
         self.advances = self._plan_advances(every, step, gauss_seidel)
         self.loops = Loops(self, self._torn, loops) if loops is not None and self._torn else None
+        self.extrapolation = (
+            Extrapolation(self, every, set(self._fresh), extrapolation)
+            if extrapolation is not None and extrapolation.order
+            else None
+        )
 
     # ── layout ───────────────────────────────────────────────────────────────────────────────────────────
 
@@ -209,6 +219,7 @@ class Plan:
             and not (self.components[o[0]].sampled or self.components[i[0]].sampled)
             and (o, i) not in graph.delayed
         }
+        self._fresh = fresh
         ports = [*sorted(set(fresh.values())), *sorted(fresh)]
         place = {port: k for k, port in enumerate(ports)}
         self.ahead: Values = np.zeros(len(ports))
@@ -297,28 +308,28 @@ class Plan:
             RunError: a component failed or gave a value that is not finite.
         """
         for a in self.advances:
-            if not k % a.every:
-                self.step(a, k, t)
+            # A last own step that leads beyond the end is left out: nobody would read what comes of it.
+            if not k % a.every and k + a.every <= self.ticks:
+                self.step(a, t, a.h)
 
-    def step(self, a: Advance, k: int, t: float) -> None:
-        """Step one component that is due at tick k.
+    def step(self, a: Advance, t: float, h: float) -> None:
+        """Step one component from t to t + h [s].
 
         Raises:
             RunError: it failed or gave a value that is not finite.
         """
-        # A last own step that leads beyond the end is left out: nobody would read what comes of it.
-        if k + a.every > self.ticks:
-            return
         if a.before is not None:
             self.exchange(a.before, self.ahead, t)
         try:
-            status = a.step(t, a.h)
+            if self.extrapolation is not None and self.extrapolation.concerns(a.component):
+                self.extrapolation.prepare(a.component, t, h)
+            status = a.step(t, h)
         except Exception as error:
             raise self.wrapped(a.component, error, t) from error
         if status:
             self.judge(a.component, status, "the step", t)
         if a.after is not None:
-            self.exchange(a.after, self.ahead, t + a.h)
+            self.exchange(a.after, self.ahead, t + h)
 
     def exchange(self, x: Exchange, vector: Values, t: float) -> None:
         """Do an exchange with inputs from `vector`, and check what comes of it."""
@@ -372,6 +383,7 @@ class Plan:
             "ahead": self.ahead,
             "warnings": warnings,
             "loops": None if self.loops is None else self.loops.save(),
+            "extrapolation": None if self.extrapolation is None else self.extrapolation.save(),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -382,6 +394,8 @@ class Plan:
         self.warnings = {name: Warned(*warned) for name, warned in state["warnings"].items()}
         if self.loops is not None:
             self.loops.restore(state["loops"])
+        if self.extrapolation is not None:
+            self.extrapolation.restore(state["extrapolation"])
 
     # ── failure ──────────────────────────────────────────────────────────────────────────────────────────
 

@@ -133,10 +133,15 @@ class Program:
         """A step, with its exchanges before and after in Gauss–Seidel."""
         native, due = self._natives[a.component], {k.EVERY: a.every, k.SPAN: a.every}
         if native is None:
-            self._add(k.PYTHON, due, Act(call=lambda tick: self._plan.step(a, tick, self._time(tick))))
+            self._add(k.PYTHON, due, Act(call=lambda tick: self._plan.step(a, self._time(tick), a.h)))
             return
         if a.before is not None:
             self._add_exchange(a.before, self._plan.ahead, due)
+        extrapolation = self._plan.extrapolation
+        if extrapolation is not None and extrapolation.concerns(a.component):
+            prepare = extrapolation.prepare
+            act = Act(call=lambda tick: prepare(a.component, self._time(tick), a.h))
+            self._add(k.PYTHON, due, act)
         step = native.step
         columns = {
             **due,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +38,17 @@ class Stepper(ABC):
         Raises:
             RunError: a component failed or gave a value that is not finite.
         """
+
+    def save(self) -> dict[str, Any]:
+        """What it remembers from one communication point to the next, in plain values."""
+        return {}
+
+    def restore(self, state: Mapping[str, Any]) -> None:  # noqa: B027 - nothing to remember by default
+        """Go on from what `save` gave."""
+
+    def report(self) -> dict[str, Any]:
+        """What is told of it when the run is over."""
+        return {}
 
 
 class Plain(Stepper):

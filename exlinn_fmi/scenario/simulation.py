@@ -58,6 +58,12 @@ class Simulate(Spec):
         "delay",
         description="algebraic loops: `delay` breaks each by one step, `solve` or settings solve them",
     )
+    extrapolation: Extrapolation | None = Field(
+        None, description="how inputs from other components go on over a step; held if not given"
+    )
+    adaptive: Adaptive | None = Field(
+        None, description="shorter communication steps where they are needed; `step` is the longest then"
+    )
     record: list[str] = Field(
         default_factory=lambda: ["*"],
         description="variables to record, with wildcards; inputs and outputs of all by default",
