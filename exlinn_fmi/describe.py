@@ -76,7 +76,10 @@ def describe_scenario(file: Path, overrides: Sequence[str]) -> str:
     if apart:
         lines.append(f"isolated, in processes of their own: {', '.join(apart)}")
     if components:
-        lines.append(Graph(components, work.scenario.connection_list()).describe())
+        span = work.scenario.simulate
+        loops = span.loop_settings if span else None
+        graph = Graph(components, work.scenario.connection_list())
+        lines.append(graph.describe(loops.solver if loops else None))
     if work.scenario.events:
         labels = event_names(work.scenario.events)
         width = max(map(len, labels))

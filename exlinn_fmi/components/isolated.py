@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import weakref
+from base64 import b64decode, b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -170,6 +171,21 @@ class IsolatedComponent(Component):
         assert isinstance(state, _SavedState)
         self._pending = -1
         self._call("restore_state", state.number, what="restoring its state")
+
+    @property
+    def can_serialize_state(self) -> bool:
+        """As the component itself."""
+        return bool(self._call("can_serialize_state", what="asking for its abilities"))
+
+    def serialize_state(self, state: object) -> bytes:
+        """A state that `save_state` returned, as bytes."""
+        assert isinstance(state, _SavedState)
+        return b64decode(self._call("serialize_state", state.number, what="serialising its state"))
+
+    def deserialize_state(self, data: bytes) -> object:
+        """A state for `restore_state`, from bytes."""
+        text = b64encode(data).decode()
+        return _SavedState(self._call("deserialize_state", text, what="deserialising its state"))
 
     def close(self) -> None:
         """Close the component and end its process."""

@@ -15,6 +15,7 @@ import select
 import struct
 import sys
 import threading
+from base64 import b64decode, b64encode
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
@@ -171,6 +172,20 @@ class Worker:
     def do_restore_state(self, number: int) -> None:
         """Go back to a saved state."""
         self._component.restore_state(self._states[number])
+
+    def do_can_serialize_state(self) -> bool:
+        """Whether saved states can be turned into bytes."""
+        return self._component.can_serialize_state
+
+    def do_serialize_state(self, number: int) -> str:
+        """A saved state as bytes, in base64."""
+        return b64encode(self._component.serialize_state(self._states[number])).decode()
+
+    def do_deserialize_state(self, data: str) -> int:
+        """A saved state made of bytes, in base64; its number."""
+        self._count += 1
+        self._states[self._count] = self._component.deserialize_state(b64decode(data))
+        return self._count
 
     def do_forget(self, numbers: list[int]) -> None:
         """Drop saved states."""

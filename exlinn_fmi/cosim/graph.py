@@ -153,16 +153,22 @@ class Graph:
 
     # ── words ────────────────────────────────────────────────────────────────────────────────────────────
 
-    def describe(self) -> str:
-        """Components in order, connections, feed-through, order of values, loops and delays as plain text."""
+    def describe(self, solver: str | None = None) -> str:
+        """Components in order, connections, feed-through, order of values, loops and delays as plain text.
+
+        Args:
+            solver: what solves algebraic loops, None where they are broken by delays.
+        """
+        solved = f", solved at each communication point ({solver})" if solver else ""
+        late = [d for d in self.delays if d.kind == "dependency" or not solver]
         sections = {
             "components, in the order in which their outputs are known": self._component_lines(),
             "connections": [self._connection_line(edge) for edge in self.connections],
             "inputs that keep their start values": self._open_inputs(),
             "direct feed-through between connected variables": self._feed_through_lines(),
             "order of values at a communication point": self._visit_lines(),
-            "algebraic loops": [" — ".join(loop) for loop in self.loops],
-            "one step late": [f"{d.source} → {d.target}: {d.reason}" for d in self.delays],
+            f"algebraic loops{solved}": [" — ".join(loop) for loop in self.loops],
+            "one step late": [f"{d.source} → {d.target}: {d.reason}" for d in late],
         }
         lines = list[str]()
         for title, content in sections.items():

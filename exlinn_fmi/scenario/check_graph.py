@@ -135,6 +135,26 @@ def steps(survey: Survey) -> Iterator[Finding]:
             yield ("components", name, "step"), no_multiple(spec.step, simulate.step, "simulate.step")
 
 
+def coupling(survey: Survey) -> Iterator[Finding]:
+    """Settings of adaptive steps that do not fit the step or name what is not there."""
+    simulate = survey.scenario.simulate
+    if simulate is None or simulate.adaptive is None:
+        return
+    at, shortest = ("simulate", "adaptive"), simulate.adaptive.min_step
+    if (
+        shortest is not None
+        and not survey.sound.in_doubt(("simulate",), "step")
+        and 2 * shortest > simulate.step
+    ):
+        yield (
+            (*at, "min_step"),
+            f"expected at most half of simulate.step, {simulate.step / 2:g} s, found {shortest:g} s",
+        )
+    for pattern in simulate.adaptive.tolerances:
+        if problem := _no_match(survey, pattern):
+            yield (*at, "tolerances", pattern), problem
+
+
 def is_multiple(own: float, base: float) -> bool:
     """Whether a step is an integer multiple of another, as far as decimals can be."""
     ratio = own / base

@@ -36,6 +36,7 @@ CHECKS = (
     check_graph.connections,
     check_graph.start_values,
     check_graph.steps,
+    check_graph.coupling,
     check_graph.recorded,
     check_events.events,
     check_learn.signals,

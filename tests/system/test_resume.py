@@ -124,3 +124,14 @@ def test_a_paced_run_reports_its_deadlines(tmp_path: Path):
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["simulate.seconds"] >= 0.25
     assert "simulate.missed_deadlines" in metrics
+
+
+def test_algorithms_are_set_in_the_scenario(tmp_path: Path):
+    file = write(
+        tmp_path, "loops: solve, extrapolation: {order: 2, smooth: true}, adaptive: {tolerance: 1e-3}"
+    )
+    line = ["simulate", str(file), "--out", str(tmp_path / "out"), "--set", "simulate.stop=0.1"]
+    assert exit_code([*line, "--set", "simulate.step=4e-3"]) == 0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["simulate.communication_steps"] >= 50
+    assert len(pd.read_csv(tmp_path / "out" / "trajectories.csv")) == 26

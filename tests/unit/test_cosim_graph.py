@@ -132,6 +132,12 @@ def test_description_shows_algebraic_loops():
     assert "b.y → a.u: algebraic loop through a, b" in text
 
 
+def test_description_says_that_loops_are_solved():
+    text = graph([Gain("a"), Gain("b")], "a.y > b.u", "b.y > a.u").describe("newton")
+    assert "algebraic loops, solved at each communication point (newton)\n  a.u — a.y — b.u — b.y" in text
+    assert text.endswith("one step late\n  none")
+
+
 def test_description_shortens_long_lists():
     wide = Small("w", *(Variable(f"y{k}", "output") for k in range(20)))
     sink = Small("s", *(Variable(f"u{k}", "input") for k in range(20)))

@@ -108,6 +108,24 @@ def test_true_is_a_start_value_of_a_boolean(tmp_path):
         ),
         ("step: 0.01", "step: 0.0004", "components.ctl.step", "the nearest is 0.001 s"),
         ("step: 1e-3", "step: 11", "simulate.step", "the step, 11 s, is longer than the run, 10 s"),
+        (
+            "algorithm: jacobi",
+            "algorithm: jacobi\n  adaptive: {min_step: 6e-4}",
+            "simulate.adaptive.min_step",
+            "expected at most half of simulate.step, 0.0005 s, found 0.0006 s",
+        ),
+        (
+            "algorithm: jacobi",
+            "algorithm: jacobi\n  adaptive: {tolerances: {plant.alhpa: 1e-3}}",
+            "simulate.adaptive.tolerances.plant.alhpa",
+            "did you mean 'alpha'?",
+        ),
+        (
+            "algorithm: jacobi",
+            "loops: {solver: newtn}",
+            "simulate.loops.solver",
+            "did you mean 'newton'?",
+        ),
         ("stop: 10", "stop: 0", "simulate.stop", "expected > 0 (simulate.start), found 0"),
         ("duration: 2\n", "duration: 2\n      step: 3\n", "learn.test[0].step", "longer than the run, 2 s"),
         (
