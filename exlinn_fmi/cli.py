@@ -215,6 +215,25 @@ def simulate(
 
 
 @app.command()
+def sweep(scenario: ScenarioFile, out: Out = None, overrides: Overrides = None) -> None:
+    """Run the closed loop many times with values drawn at random. Ctrl-C keeps the runs so far.
+
+    Called again it goes on where it was stopped; more repetitions add to those that there are.
+
+    Example: exlinn sweep scenarios/dcwc_robustness.yaml --set study.repetitions=200
+    """
+    from exlinn_fmi import pipeline
+
+    def work_on(work: Run) -> None:
+        pipeline.sweep(work)
+        pipeline.report(work.folder)
+
+    work = perform(work_on, scenario, out, overrides)
+    show_metrics(work.folder, "study.")
+    typer.echo(f"\n{work.folder / 'study.csv'}")
+
+
+@app.command()
 def report(
     folder: Annotated[Path, typer.Argument(help="Run folder, e.g. runs/dcwc_tracking.", metavar="FOLDER")],
 ) -> None:

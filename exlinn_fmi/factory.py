@@ -17,6 +17,7 @@ from exlinn_fmi.scenario.schema import (
     PlantComponent,
     PythonComponentSpec,
     Scenario,
+    SensorComponent,
     SignalComponent,
 )
 
@@ -66,6 +67,10 @@ def build(name: str, scenario: Scenario, folder: Path, run_folder: Path) -> Comp
 
         memory = None if spec.memory is None else 1e6 * spec.memory
         return isolated_fmu(name, folder / spec.fmu, spec.timeout, memory, fmu_settings(spec))
+    if isinstance(spec, SensorComponent):
+        from exlinn_fmi.components.sensor import Sensor
+
+        return Sensor(name, spec.sensor, scenario.seed)
     if not isinstance(spec, NmpcComponent):
         return make(name, spec, folder, run_folder)
     from exlinn_fmi.control.controller import NmpcController
@@ -99,6 +104,10 @@ def make(name: str, spec: ComponentBase, folder: Path, run_folder: Path) -> Comp
         from exlinn_fmi.components.signals import SignalSource
 
         return SignalSource(name, spec.source, folder)
+    if isinstance(spec, SensorComponent):
+        from exlinn_fmi.components.sensor import Sensor
+
+        return Sensor(name, spec.sensor, 0)
     if isinstance(spec, PythonComponentSpec):
         return load_python_component(spec.python, name, spec.options, folder)
     raise TypeError(f"no component for {type(spec).__name__}")
@@ -152,4 +161,4 @@ def outline(name: str, scenario: Scenario, folder: Path) -> Component:
     spec = scenario.components[name]
     learned = [c.coordinate() for c in scenario.learn.coordinates] if scenario.learn else []
     variables = derived_variables(spec, learned) or inspect(spec, folder)
-    return Outline(name, variables, isinstance(spec, SignalComponent | NmpcComponent))
+    return Outline(name, variables, isinstance(spec, SignalComponent | SensorComponent | NmpcComponent))

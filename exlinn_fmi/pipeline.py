@@ -1,4 +1,4 @@
-"""The way data flows, on one page: scenario → data set → learned model → closed loop → report.
+"""The way data flows, on one page: scenario → data set → learned model → closed loop (many) → report.
 
 Every stage leaves its files in the run folder and is skipped when nothing that it depends on has changed
 (`stages.py`). Parts are imported where they are used: a co-simulation never loads PyTorch.
@@ -30,6 +30,8 @@ def run(work: Run, resume: bool = False) -> dict[str, Any]:
             train(work)
         if work.scenario.simulate is not None:
             simulate(work, resume)
+        if work.scenario.study is not None:
+            sweep(work)
     except RunError:
         # The report shows what there is so far; should it fail as well, the first error is the one to tell.
         with suppress(ExlinnError):
@@ -199,6 +201,39 @@ def simulate(work: Run, resume: bool = False) -> None:
     if result.error is not None:
         raise work.failed("simulate", result.error)
     work.done("simulate", key, written, began)
+
+
+def sweep(work: Run) -> None:
+    """Run the closed loop many times as `study` says; save each run's result and what all of them tell.
+
+    Raises:
+        InputError: the scenario has no study.
+    """
+    from exlinn_fmi import study as studies
+
+    study, scenario = studies.study_of(work), work.scenario
+    if any(uses_learned(spec) for spec in scenario.components.values()):
+        train(work)
+    model = [path for path in work.folder.glob("model.*") if uses_learned(scenario)]
+    settings = scenario.model_dump(mode="json")
+    # A longer study goes on with a shorter one.
+    settings["study"] = study.model_dump(mode="json", exclude={"repetitions", "workers"})
+    runs = fingerprint(settings, files=[*work.files(scenario), *sorted(model)])
+    key = fingerprint(runs, study.repetitions)
+    if work.unchanged("sweep", key, f"{study.repetitions} runs, {len(study.vary)} values drawn for each"):
+        return
+    began = time.perf_counter()
+    try:
+        frame = studies.sweep(work, runs)
+    except ExlinnError as error:
+        raise work.failed("sweep", error) from None
+    if len(frame):
+        work.replace_metrics(("study.",), studies.summary(frame))
+    if work.stop.take():
+        work.warn(f"the study was stopped after {len(frame)} runs; run it again to go on")
+        work.noted("sweep", "interrupted", None)
+    else:
+        work.done("sweep", key, [work.folder / "study.csv"], began)
 
 
 def report(folder: Path, reporter: Reporter | None = None) -> Path:

@@ -49,6 +49,7 @@ class _Memory:
         cost: last cost.
         stage: its first term.
         P: terminal weight of the last solve.
+        error: state less reference that it expects at the coming tick.
         kkt: last KKT residual.
         slack: last violation of a state bound.
     """
@@ -64,6 +65,7 @@ class _Memory:
     cost: float = 0.0
     stage: float = 0.0
     P: NDArray[np.float64] | None = None
+    error: NDArray[np.float64] | None = None
     kkt: float = 0.0
     slack: float = 0.0
 
@@ -242,7 +244,7 @@ class NmpcController(Component):
         )
         applied = u if not self._slow else self._safe if memory.applied is None else memory.applied
         at_tick = ahead if not self._slow else now
-        change = self._change(memory, state) if ahead is not None else 0.0
+        change = 0.0 if ahead is None else self._change(memory, state - references.x[0])
         self._write(applied, reported, at_tick, solution, change, perf_counter() - begin)
         if solution.status == SolveStatus.SOLVED and not self._missing():
             return Status.OK
@@ -266,14 +268,14 @@ class NmpcController(Component):
         names = [self.variables[k].name for k in np.flatnonzero(wrong)]
         return f"measurement of {', '.join(names)} is not finite" if names else ""
 
-    def _change(self, memory: _Memory, state: NDArray[np.float64]) -> float:
-        """Most that the cost may grow by the state's being off its prediction.
+    def _change(self, memory: _Memory, error: NDArray[np.float64]) -> float:
+        """Most that the cost may grow by the error's being off its prediction, by w.
 
-        With a cost xᵀPx: (x + w)ᵀP(x + w) − xᵀPx ≤ 2 √(xᵀPx wᵀPw) + wᵀPw.
+        With a cost eᵀPe: (e + w)ᵀP(e + w) − eᵀPe ≤ 2 √(eᵀPe wᵀPw) + wᵀPw.
         """
-        if memory.plan is None or memory.P is None:
+        if memory.error is None or memory.P is None:
             return 0.0
-        w = state - memory.plan.x[0]
+        w = error - memory.error
         off = max(0.0, float(w @ memory.P @ w))
         return 2.0 * float(np.sqrt(max(0.0, memory.cost - memory.stage) * off)) + off
 
@@ -296,6 +298,7 @@ class NmpcController(Component):
             cost=stats.cost,
             stage=stage,
             P=P,
+            error=plan.x[0] - references.x[1],
             kkt=stats.kkt,
             slack=stats.slack,
         )

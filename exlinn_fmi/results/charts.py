@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.results.metrics import Loop, control_loops
 from exlinn_fmi.results.panels import Chart, Line, Panel, Role, extremes
+from exlinn_fmi.results.robustness import study_charts
 from exlinn_fmi.results.tables import LEARNED, RunFiles, Table
 from exlinn_fmi.results.typography import readable, typeset, words
 
@@ -49,6 +50,8 @@ def charts(run: RunFiles) -> list[Chart]:
         if not loops:
             drawn = [trajectory_chart(run.trajectories, run.scenario.connection_list())]
         made += [_with_events(chart, run.trajectories) for chart in drawn if chart is not None]
+    if run.study is not None and run.scenario.study is not None:
+        made += study_charts(run.study, list(run.scenario.study.vary))
     return [replace(c, panels=tuple(map(_legible, c.panels))) for c in made if c is not None]
 
 

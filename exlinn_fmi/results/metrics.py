@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from exlinn_fmi.scenario.control import Nmpc
-from exlinn_fmi.scenario.schema import NmpcComponent, Scenario
+from exlinn_fmi.scenario.schema import NmpcComponent, Scenario, SensorComponent
+from exlinn_fmi.scenario.signals import MEASURED
 from exlinn_fmi.scenario.spec import Bounds
 
 if TYPE_CHECKING:
@@ -31,6 +32,10 @@ DIAGNOSTICS = (
 )
 FAMILIES = ("reference_", "estimate_", "disturbance_")
 """Outputs of a controller that are not inputs of the plant: their names, and how others begin."""
+DECREASE_TOLERANCE = 1e-3
+"""Share of the cost that its decrease may miss: a real-time iteration is not converged."""
+NO_COST = 1e-6
+"""Share of a run's largest cost that counts as none: there the reference's own rounding shows."""
 BOUND_TOLERANCE = 1e-6
 """Share of the range between two bounds by which a value may be outside: the solver's tolerance."""
 
@@ -108,9 +113,9 @@ def control_loops(scenario: Scenario) -> list[Loop]:
         for source, target in connections:
             owner, variable = source.split(".", 1)
             if owner == name and variable not in DIAGNOSTICS and not variable.startswith(FAMILIES):
-                inputs.setdefault(variable, target)
+                inputs.setdefault(variable, _beyond(scenario, target))
         states = {
-            target.split(".", 1)[1]: source
+            target.split(".", 1)[1]: _before(scenario, source)
             for source, target in connections
             if target.split(".", 1)[0] == name
         }
@@ -127,6 +132,23 @@ def control_loops(scenario: Scenario) -> list[Loop]:
             )
         )
     return loops
+
+
+def _before(scenario: Scenario, path: str) -> str:
+    """The variable that a sensor measures, for one of its outputs; any other path as it is."""
+    component, variable = path.split(".", 1)
+    if isinstance(scenario.components.get(component), SensorComponent):
+        inputs = {target: source for source, target in scenario.connection_list()}
+        return inputs.get(f"{component}.{variable.removesuffix(MEASURED)}", path)
+    return path
+
+
+def _beyond(scenario: Scenario, path: str) -> str:
+    """The variable that a signal reaches through a sensor (a late actuator); any other path as it is."""
+    component, variable = path.split(".", 1)
+    if isinstance(scenario.components.get(component), SensorComponent):
+        return dict(scenario.connection_list()).get(f"{component}.{variable}{MEASURED}", path)
+    return path
 
 
 def control_metrics(frame: pd.DataFrame, scenario: Scenario, units: Mapping[str, str]) -> dict[str, float]:
@@ -150,6 +172,7 @@ def control_metrics(frame: pd.DataFrame, scenario: Scenario, units: Mapping[str,
         own = {
             **_tracking(frame, loop, units),
             **_violations(frame, loop),
+            **_decrease(frame, loop),
             **_effort(frame, loop),
         }
         metrics |= {prefix + key: value for key, value in own.items()}
@@ -219,6 +242,25 @@ def _violations(frame: pd.DataFrame, loop: Loop) -> dict[str, float]:
     return {"violations": float(count)} if len(frame) else {}
 
 
+def _decrease(frame: pd.DataFrame, loop: Loop) -> dict[str, float]:
+    """Share of the samples at which the cost, as a Lyapunov function, fell as it should.
+
+    J may not exceed what is left of it after a sample, J less its first term, by more than the distance of
+    the state from its prediction explains (D. Mayne et al., Constrained model predictive control: stability
+    and optimality, Automatica 36, 2000).
+    """
+    columns = [loop.own(name) for name in ("cost", "stage_cost", "cost_disturbance")]
+    if not set(columns) <= set(frame.columns):
+        return {}
+    rows = loop.samples(frame["time"].to_numpy(dtype=float))
+    cost, stage, change = frame[columns].to_numpy(dtype=float)[rows].T
+    if len(cost) < 2:
+        return {}
+    allowed = (cost - stage)[:-1] + change[1:]
+    fell = cost[1:] <= allowed + DECREASE_TOLERANCE * cost[:-1] + NO_COST * cost.max()
+    return {"decrease": float(np.mean(fell))}
+
+
 def _effort(frame: pd.DataFrame, loop: Loop) -> dict[str, float]:
     """Solve time, fallbacks, iterations, cost and input power, each where it was recorded."""
     rows = loop.samples(frame["time"].to_numpy(dtype=float))
@@ -234,8 +276,11 @@ def _effort(frame: pd.DataFrame, loop: Loop) -> dict[str, float]:
         metrics["solve_ms_median"] = float(np.median(solve))
         metrics["solve_ms_p99"] = float(np.percentile(solve, 99))
         metrics["solve_ms_max"] = float(np.max(solve))
+        metrics["deadline_misses"] = float(np.count_nonzero(solve > 1e3 * loop.period))
     if (fallbacks := recorded("fallbacks")).size:
         metrics["fallbacks"] = float(fallbacks[-1])
+    if (missing := recorded("missing")).size and missing.any():
+        metrics["missing_measurements"] = float(missing.sum())
     for output in ("iterations", "cost"):
         if (values := recorded(output)).size:
             metrics[f"{output}_mean"] = float(np.mean(values))

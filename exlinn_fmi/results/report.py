@@ -21,8 +21,16 @@ if TYPE_CHECKING:
     import pandas as pd
 
 TEMPLATE = Path(__file__).with_name("page.html")
-SECTION_OF = {"fig3_learning": "learning", "training": "learning", "trajectories": "trajectories"}
+SECTION_OF = {
+    "fig3_learning": "learning",
+    "training": "learning",
+    "trajectories": "trajectories",
+    "study_runs": "study",
+    "study_causes": "study",
+}
 """Which section a chart belongs to; those of controllers belong to `control`."""
+WORST = 5
+"""How many of the worst runs of a study are listed."""
 
 
 def write_report(folder: Path) -> Path:
@@ -53,6 +61,7 @@ def render(run: RunFiles) -> str:
         "metrics": ("Metrics", _metrics(run)),
         "learning": ("Learning", _charts(drawn, "learning") + _parameters(run.parameters)),
         "control": ("Closed loop", _charts(drawn, "control")),
+        "study": ("Robustness", _charts(drawn, "study") + _worst(run)),
         "trajectories": ("Trajectories", _charts(drawn, "trajectories")),
         "run": ("Run", _stages(run.provenance)),
         "provenance": ("Provenance", _provenance(run.provenance)),
@@ -169,6 +178,33 @@ def _parameters(parameters: pd.DataFrame | None) -> str:
     ]
     numbers = {k for k, c in enumerate(known) if c in digits}
     return "<h3>Identified parameters</h3>" + _table([titles.get(c, c) for c in known], rows, numbers)
+
+
+def _worst(run: RunFiles) -> str:
+    """The runs of a study that went worst, with what was drawn for them."""
+    if run.study is None or run.scenario.study is None:
+        return ""
+    frame = run.study
+    error = next((str(c) for c in frame.columns if str(c).startswith("control.rmse_")), None)
+    order = ["success", *([error] if error else [])]
+    worst = frame.sort_values(order, ascending=[True, False][: len(order)], na_position="first").head(WORST)
+    varied = [path for path in run.scenario.study.vary if path in frame.columns]
+    columns = [
+        "run",
+        "success",
+        *([error] if error else []),
+        *varied,
+        *(["error"] if "error" in frame else []),
+    ]
+    titles = [escape(c.removeprefix("components.").removeprefix("control.")) for c in columns]
+
+    def shown(value: object) -> str:
+        if isinstance(value, float):
+            return "" if value != value else number(value, 4)
+        return escape(str(value))
+
+    rows = [[shown(cell) for cell in row] for row in worst[columns].itertuples(index=False)]
+    return "<h3>Worst runs</h3>" + _table(titles, rows)
 
 
 def _stages(provenance: Mapping[str, Any]) -> str:

@@ -52,6 +52,7 @@ class RunFiles:
         training: loss over iterations.
         parameters: identified parameters with their true values.
         trajectories: what the co-simulation recorded.
+        study: one row for each run of a robustness study.
         metrics: value (or text) by flat key, None where it was not finite.
         provenance: what `provenance` gave.
     """
@@ -63,6 +64,7 @@ class RunFiles:
     training: pd.DataFrame | None = None
     parameters: pd.DataFrame | None = None
     trajectories: Table | None = None
+    study: pd.DataFrame | None = None
     metrics: Mapping[str, float | str | None] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
@@ -92,6 +94,7 @@ def read_run(folder: Path) -> RunFiles:
         training=_csv(folder / "training.csv"),
         parameters=_csv(folder / "parameters.csv"),
         trajectories=_table(folder / "trajectories"),
+        study=_csv(folder / "study.csv"),
         metrics=_json(folder / "metrics.json"),
         provenance=_json(folder / "provenance.json"),
     )

@@ -15,6 +15,7 @@ GROUPS = {
     "identify": "Identification",
     "control": "Closed loop",
     "simulate": "Simulation",
+    "study": "Robustness",
 }
 """Groups of metrics in the order of the report, by the first part of their keys."""
 
@@ -41,9 +42,22 @@ WORDING = (
     (r"control\.solve_ms_median", "Time of a solve, median", "ms"),
     (r"control\.solve_ms_p99", "Time of a solve, 99th percentile", "ms"),
     (r"control\.solve_ms_max", "Time of a solve, longest", "ms"),
+    (r"control\.deadline_misses", "Solves that took longer than the sampling time", ""),
+    (r"control\.missing_measurements", "Measurements that were no number, and were predicted", ""),
+    (r"control\.decrease", "Samples at which the cost fell as a Lyapunov function must", ""),
     (r"control\.fallbacks", "Steps that fell back to the previous plan", ""),
     (r"control\.iterations_mean", "Solver iterations a step, mean", ""),
     (r"control\.cost_mean", "Cost J, mean", ""),
+    (r"study\.runs", "Runs", ""),
+    (r"study\.success_rate", "Share of successes", ""),
+    (r"study\.success_rate_low", "… at least (95 %)", ""),
+    (r"study\.success_rate_high", "… at most (95 %)", ""),
+    (r"study\.failed", "Runs that ended with an error", ""),
+    (r"study\.runs_with_(.+)", "Runs with {0}", ""),
+    (r"study\.decrease_p50", "Samples at which the cost fell as it must, median of the runs", ""),
+    (r"study\.decrease_min", "… in the worst run", ""),
+    (r"study\.(rmse|max_error)_(.+)_p(\d+)", "{0} of {1}, {2} % of the runs stay below", ""),
+    (r"study\.(rmse|max_error)_(.+)_max", "{0} of {1}, worst run", ""),
     (r"simulate\.steps", "Communication steps", ""),
     (r"simulate\.seconds", "Time of the co-simulation", "s"),
     (r"simulate\.real_time_factor", "Faster than real time by a factor of", ""),
@@ -59,6 +73,8 @@ HEADLINES = (
     r"identify\.max_rel_error",
     r"control\.(\w+\.)?rmse_.*",
     r"control\.(\w+\.)?violations",
+    r"study\.success_rate",
+    r"study\.rmse_.*_p95",
     r"control\.(\w+\.)?solve_ms_median",
 )
 """Keys of the numbers that a report begins with."""

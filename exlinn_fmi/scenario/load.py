@@ -11,7 +11,14 @@ from typing import Any
 from pydantic import BaseModel
 
 from exlinn_fmi.errors import Problem, ScenarioError
-from exlinn_fmi.scenario import check_data, check_design, check_events, check_graph, check_learn
+from exlinn_fmi.scenario import (
+    check_data,
+    check_design,
+    check_events,
+    check_graph,
+    check_learn,
+    check_study,
+)
 from exlinn_fmi.scenario.document import Document, parse
 from exlinn_fmi.scenario.editor import json_schema
 from exlinn_fmi.scenario.explain import Finding, schema_findings
@@ -44,6 +51,7 @@ CHECKS = (
     check_learn.control,
     check_data.measured,
     check_design.design,
+    check_study.study,
 )
 
 
@@ -56,6 +64,7 @@ class LoadedScenario:
         file: the file it was read from.
         folder: the folder that its relative paths start from.
         text: the scenario as run: the file's text, with overrides written in.
+        overrides: what was written in.
     """
 
     scenario: Scenario
@@ -63,6 +72,7 @@ class LoadedScenario:
     folder: Path
     text: str
     _lines: dict[str, int] = field(repr=False, compare=False)
+    overrides: tuple[str, ...] = ()
 
     def line(self, path: str) -> int:
         """Line in the file of a key path such as ``learn.training[0].duration``, 0 where it has none."""
@@ -107,7 +117,7 @@ def load_scenario(
     if problems:
         raise ScenarioError(str(file), list(dict.fromkeys(problems)))
     lines = {key_path(at): line for at, line in document.lines.items()}
-    return LoadedScenario(Scenario.model_validate(data), file, file.parent, text, lines)
+    return LoadedScenario(Scenario.model_validate(data), file, file.parent, text, lines, tuple(overrides))
 
 
 def _read(file: Path) -> str:

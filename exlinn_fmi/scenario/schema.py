@@ -16,7 +16,7 @@ from pydantic import Discriminator, Field, Tag
 from exlinn_fmi.scenario.control import Nmpc
 from exlinn_fmi.scenario.events import Event
 from exlinn_fmi.scenario.learning import AnyLearn
-from exlinn_fmi.scenario.signals import Signal
+from exlinn_fmi.scenario.signals import Channel, Signal
 from exlinn_fmi.scenario.simulation import Simulate as Simulate
 from exlinn_fmi.scenario.spec import (
     Name,
@@ -28,6 +28,7 @@ from exlinn_fmi.scenario.spec import (
     form,
     telling_key,
 )
+from exlinn_fmi.scenario.study import Study
 
 # ── components ───────────────────────────────────────────────────────────────────────────────────────────
 
@@ -88,6 +89,12 @@ class SignalComponent(ComponentBase):
     source: Signal = Field(description="the signal")
 
 
+class SensorComponent(ComponentBase):
+    """Noise, resolution and delay of signals: input `x`, output `x_measured`, sampled at its `step`."""
+
+    sensor: dict[Name, Channel] = Field(min_length=1, description="what becomes of each signal, by its name")
+
+
 class ModelComponent(ComponentBase):
     """A learned model, run as if it were the plant."""
 
@@ -107,6 +114,7 @@ COMPONENT_KEYS: Mapping[str, type[Spec]] = {
     "plant": PlantComponent,
     "python": PythonComponentSpec,
     "source": SignalComponent,
+    "sensor": SensorComponent,
     "model": ModelComponent,
     "nmpc": NmpcComponent,
 }
@@ -123,6 +131,7 @@ ComponentSpec = Annotated[
     | Annotated[PlantComponent, Tag("plant")]
     | Annotated[PythonComponentSpec, Tag("python")]
     | Annotated[SignalComponent, Tag("source")]
+    | Annotated[SensorComponent, Tag("sensor")]
     | Annotated[ModelComponent, Tag("model")]
     | Annotated[NmpcComponent, Tag("nmpc")],
     Discriminator(component_kind),
@@ -195,6 +204,9 @@ class Scenario(Spec):
     )
     learn: AnyLearn | None = Field(None, description="learn a model of one component, or of measured data")
     simulate: Simulate | None = Field(None, description="run the components together")
+    study: Study | None = Field(
+        None, description="run the closed loop many times, with values drawn at random"
+    )
     metrics: Metrics = Field(default_factory=lambda: Metrics(), description="how the closed loop is judged")
 
     def trusts(self, file: Path, folder: Path) -> bool:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from exlinn_fmi.scenario.spec import Band, Positive, Spec
+from exlinn_fmi.scenario.spec import Band, NonNegative, Positive, Spec
 
 
 class Constant(Spec):
@@ -96,6 +96,20 @@ class Table(Spec):
     interpolation: Literal["linear", "hold"] = Field("linear", description="between rows")
     outside: Literal["hold", "error"] = Field("hold", description="before the first and after the last row")
     unit: str | None = Field(None, description="unit of the signal, e.g. V")
+
+
+MEASURED = "_measured"
+"""What a sensor appends to the name of a signal."""
+
+
+class Channel(Spec):
+    """What a sensor makes of one signal: (late signal + offset + noise), rounded to its resolution."""
+
+    unit: str | None = Field(None, description="unit of the signal, e.g. rad")
+    noise: NonNegative = Field(0.0, description="standard deviation of white noise")
+    offset: float = Field(0.0, description="constant error")
+    resolution: NonNegative = Field(0.0, description="distance of the values that it can give; 0: all")
+    delay: int = Field(0, ge=0, le=1000, description="samples by which it is late")
 
 
 Signal = Annotated[
