@@ -264,7 +264,7 @@ def wilson(good: float, count: int) -> tuple[float, float]:
     share, spread = good / count, z**2 / count
     centre = (share + spread / 2) / (1 + spread)
     half = z / (1 + spread) * math.sqrt(share * (1 - share) / count + spread / (4 * count))
-    return max(0.0, centre - half), min(1.0, centre + half)
+    return 0.0 if good == 0 else centre - half, 1.0 if good == count else centre + half
 
 
 # ── on disk ──────────────────────────────────────────────────────────────────────────────────────────────

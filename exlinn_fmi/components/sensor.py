@@ -6,9 +6,9 @@ from collections import deque
 
 import numpy as np
 
-from exlinn_fmi.components.base import Variable
 from exlinn_fmi.components.python import PythonComponent
-from exlinn_fmi.scenario.signals import MEASURED, Channel
+from exlinn_fmi.scenario.derived import sensor_variables
+from exlinn_fmi.scenario.signals import Channel
 
 
 class Sensor(PythonComponent):
@@ -64,21 +64,3 @@ class Sensor(PythonComponent):
         assert isinstance(state, tuple)
         self._random.bit_generator.state, self._noise, past = state
         self._past = [one.copy() for one in past]
-
-
-def sensor_variables(channels: dict[str, Channel]) -> tuple[Variable, ...]:
-    """Variables of a sensor: its inputs, then its outputs."""
-    return (
-        *(Variable(name, "input", unit=c.unit, start=0.0) for name, c in channels.items()),
-        *(
-            Variable(
-                f"{name}{MEASURED}",
-                "output",
-                "discrete",
-                unit=c.unit,
-                description=f"measured {name}",
-                depends_on=() if c.delay else (name,),
-            )
-            for name, c in channels.items()
-        ),
-    )

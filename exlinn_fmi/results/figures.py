@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
+FEW_POINTS = 500
+"""Up to so many points are drawn large."""
 DASHES: dict[Role, Any] = {"model": (0, (4, 2)), "reference": (0, (4, 2)), "bound": (0, (1, 1.5))}
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -245,7 +247,7 @@ def _plot(axes: Axes, line: Line, colour: str, most: int) -> None:
         color=colour,
         linestyle="none" if line.points else DASHES.get(line.role, "-"),
         marker="." if line.points else None,
-        markersize=2,
+        markersize=2 if len(kept) > FEW_POINTS else 4,
         markeredgewidth=0,
         linewidth=1.3 if line.role in ("model", "reference") else 0.9,
         drawstyle="steps-post" if line.held else "default",

@@ -25,14 +25,14 @@ def study_charts(study: pd.DataFrame, varied: Sequence[str]) -> list[Chart | Non
         study: one row for each run.
         varied: key paths of what was drawn.
     """
+    shown = ("control.rmse_", "control.max_error_", "control.violations", "control.decrease")
     judged = [
         str(c)
         for c in study.columns
-        if str(c).startswith(
-            ("control.rmse_", "control.max_error_", "control.violations", "control.decrease")
-        )
-        and np.isfinite(study[c].to_numpy(dtype=float)).any()
+        if str(c).startswith(shown) and np.isfinite(_numbers(study, str(c))).any()
     ]
+    if "control.violations" in judged and not np.nansum(_numbers(study, "control.violations")):
+        judged.remove("control.violations")
     panels = []
     for column in judged:
         values = np.sort(_numbers(study, column)[np.isfinite(_numbers(study, column))])
@@ -73,7 +73,7 @@ def _dependence_chart(study: pd.DataFrame, error: str, varied: Sequence[str]) ->
     panels = [panel for _, panel in sorted(ranked, key=lambda pair: pair[0])[:MOST_CAUSES]]
     if not panels:
         return None
-    title = "What the error hangs on: each value drawn, from its least to its greatest, most telling first"
+    title = "What the error hangs on, most telling first"
     return Chart("study_causes", title, tuple(panels), x_label="place in its range [%]")
 
 

@@ -7,7 +7,14 @@ from collections.abc import Sequence
 from exlinn_fmi.components.base import Variable, VariableType
 from exlinn_fmi.mechanics.coordinates import Coordinate, state_names, state_units
 from exlinn_fmi.scenario.control import Nmpc, Reference, ScotchYoke
-from exlinn_fmi.scenario.schema import ComponentBase, ModelComponent, NmpcComponent, SignalComponent
+from exlinn_fmi.scenario.schema import (
+    ComponentBase,
+    ModelComponent,
+    NmpcComponent,
+    SensorComponent,
+    SignalComponent,
+)
+from exlinn_fmi.scenario.signals import MEASURED, Channel
 
 
 def derived_variables(spec: ComponentBase, learned: Sequence[Coordinate]) -> tuple[Variable, ...] | None:
@@ -19,11 +26,31 @@ def derived_variables(spec: ComponentBase, learned: Sequence[Coordinate]) -> tup
     """
     if isinstance(spec, SignalComponent):
         return (Variable("y", "output", unit=spec.source.unit),)
+    if isinstance(spec, SensorComponent):
+        return sensor_variables(spec.sensor)
     if isinstance(spec, ModelComponent) and spec.model == "learned" and learned:
         return model_variables(tuple(learned))
     if isinstance(spec, NmpcComponent) and spec.nmpc.model == "learned" and learned:
         return nmpc_variables(tuple(learned), spec.nmpc)
     return None
+
+
+def sensor_variables(channels: dict[str, Channel]) -> tuple[Variable, ...]:
+    """Variables of a sensor: its inputs, then its outputs."""
+    return (
+        *(Variable(name, "input", unit=c.unit, start=0.0) for name, c in channels.items()),
+        *(
+            Variable(
+                f"{name}{MEASURED}",
+                "output",
+                "discrete",
+                unit=c.unit,
+                description=f"measured {name}",
+                depends_on=() if c.delay else (name,),
+            )
+            for name, c in channels.items()
+        ),
+    )
 
 
 def model_variables(coordinates: tuple[Coordinate, ...]) -> tuple[Variable, ...]:

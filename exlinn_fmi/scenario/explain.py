@@ -26,6 +26,7 @@ from exlinn_fmi.scenario.places import (
 )
 from exlinn_fmi.scenario.schema import ComponentBase, ComponentSpec, Scenario
 from exlinn_fmi.scenario.spec import Spec
+from exlinn_fmi.scenario.study import Relative
 from exlinn_fmi.scenario.words import KeyPath, closest, either, found, listing, suggestion
 
 Finding = tuple[KeyPath, str]
@@ -236,8 +237,9 @@ def _no_form(place: Place) -> Finding:
     if typo is not None:
         return (*place.path, typo), f"unknown key {typo!r}{suggestion(typo, names)}"
     if key is None:
-        is_component = issubclass(forms[0], ComponentBase)
-        what = "what kind of component this is" if is_component else "what to learn from"
+        is_component, is_law = issubclass(forms[0], ComponentBase), issubclass(forms[0], Relative)
+        what = "how this is distributed" if is_law else "what to learn from"
+        what = "what kind of component this is" if is_component else what
         return place.path, f"nothing says {what}; give one of the keys {', '.join(kinds)}"
     return place.path, f"missing key {key!r}{listing(kinds, 'one of')}"
 

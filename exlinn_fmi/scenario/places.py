@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, TypeGuard, Union, get_args, get_orig
 from exlinn_fmi.scenario.learning import LEARN_KEYS
 from exlinn_fmi.scenario.schema import COMPONENT_KEYS, Scenario
 from exlinn_fmi.scenario.spec import Spec, telling_key
+from exlinn_fmi.scenario.study import DISTRIBUTION_KEYS
 from exlinn_fmi.scenario.words import KeyPath
 
 
@@ -41,7 +42,9 @@ def kind_field(model: type[Spec]) -> str | None:
 
 def telling_keys(model: Any) -> Mapping[str, type[Spec]]:
     """The keys one of which tells which of several sections is meant, and what they make; {} if none does."""
-    return next((keys for keys in (COMPONENT_KEYS, LEARN_KEYS) if model in keys.values()), {})
+    return next(
+        (keys for keys in (COMPONENT_KEYS, LEARN_KEYS, DISTRIBUTION_KEYS) if model in keys.values()), {}
+    )
 
 
 def choose(annotation: Any, value: Any) -> Any:

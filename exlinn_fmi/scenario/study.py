@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag
@@ -36,7 +37,12 @@ class Choice(Spec):
     values: list[Any] = Field(min_length=1, description="the values")
 
 
-KINDS = {"relative": Relative, "min": Range, "mean": Normal, "values": Choice}
+DISTRIBUTION_KEYS: Mapping[str, type[Spec]] = {
+    "relative": Relative,
+    "min": Range,
+    "mean": Normal,
+    "values": Choice,
+}
 """The key that tells how a value is distributed."""
 
 Distribution = Annotated[
@@ -44,7 +50,7 @@ Distribution = Annotated[
     | Annotated[Range, Tag("min")]
     | Annotated[Normal, Tag("mean")]
     | Annotated[Choice, Tag("values")],
-    Discriminator(lambda value: telling_key(value, KINDS)),
+    Discriminator(lambda value: telling_key(value, DISTRIBUTION_KEYS)),
 ]
 
 

@@ -20,6 +20,7 @@ from exlinn_fmi.scenario.schema import (
     NmpcComponent,
     PythonComponentSpec,
     Scenario,
+    SensorComponent,
     SignalComponent,
     component_kind,
 )
@@ -174,7 +175,7 @@ def _settled(name: str, spec: ComponentBase, sound: Sound) -> bool:
     if isinstance(spec, PythonComponentSpec):
         return not sound.in_doubt(at, "options")
     learned = isinstance(spec, ModelComponent) and spec.model == "learned"
-    return not learned and not isinstance(spec, SignalComponent)
+    return not learned and not isinstance(spec, SignalComponent | SensorComponent)
 
 
 def _files(name: str, spec: ComponentBase, folder: Path) -> Iterator[Finding]:

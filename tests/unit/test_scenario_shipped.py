@@ -179,7 +179,7 @@ def test_every_kind_of_component_is_known_by_a_key_of_its_own():
     (components,) = json_schema()["properties"]["components"]["patternProperties"].values()
     definitions = json_schema()["$defs"]
     kinds = [definitions[c["$ref"].rpartition("/")[2]]["required"] for c in components["oneOf"]]
-    assert kinds == [["fmu"], ["plant"], ["python"], ["source"], ["model"], ["nmpc"]]
+    assert kinds == [["fmu"], ["plant"], ["python"], ["source"], ["sensor"], ["model"], ["nmpc"]]
 
 
 # ── what the scenario settles by itself ──────────────────────────────────────────────────────────────────
