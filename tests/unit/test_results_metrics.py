@@ -108,7 +108,35 @@ def test_a_missing_column_costs_only_its_metrics(
 ) -> None:
     fewer = control_metrics(frame.drop(columns=column), scenario(), UNITS)
     assert fewer.items() <= metrics.items()
-    assert len(fewer) >= len(metrics) - 3
+    assert len(fewer) >= len(metrics) - 4
+
+
+def with_costs(frame: pd.DataFrame, cost: list[float], change: float = 0.0) -> pd.DataFrame:
+    """A run whose cost at the first samples is that, each with a first term of 1."""
+    rows = frame.iloc[: 10 * len(cost)].copy()
+    held = np.repeat(cost, 10)
+    more = {"cost": held, "stage_cost": np.ones(len(held)), "cost_disturbance": np.full(len(held), change)}
+    return rows.assign(**{f"controller.{name}": values for name, values in more.items()})
+
+
+def test_a_cost_that_falls_by_its_first_term_falls_as_it_should(frame: pd.DataFrame) -> None:
+    falling = with_costs(frame, [9.0, 8.0, 7.0, 6.0, 5.0])
+    assert control_metrics(falling, scenario(), UNITS)["control.decrease"] == 1.0
+
+
+def test_a_cost_that_falls_by_less_is_counted_unless_a_disturbance_explains_it(frame: pd.DataFrame) -> None:
+    costs = [9.0, 8.5, 7.5, 9.0, 8.0]
+    assert control_metrics(with_costs(frame, costs), scenario(), UNITS)["control.decrease"] == 0.5
+    disturbed = with_costs(frame, costs, change=3.0)
+    assert control_metrics(disturbed, scenario(), UNITS)["control.decrease"] == 1.0
+
+
+def test_solves_longer_than_the_sampling_time_miss_their_deadline(frame: pd.DataFrame) -> None:
+    late = frame.copy()
+    late.loc[20:49, "controller.solve_time"] = 0.011  # three samples
+    metrics = control_metrics(late, scenario(), UNITS)
+    assert metrics["control.deadline_misses"] == 3
+    assert control_metrics(frame, scenario(), UNITS)["control.deadline_misses"] == 0
 
 
 def test_a_run_that_failed_at_once_has_no_metrics(frame: pd.DataFrame) -> None:

@@ -45,7 +45,7 @@ def inspect(spec: object, folder: Path) -> tuple[Variable, ...]:
         *(Variable(name, "input", unit=unit, start=0.0) for name, unit in inputs.items()),
         *(Variable(name, "output", unit=unit, start=0.0) for name, unit in states.items()),
         *(Variable(name, "output", unit=unit) for name, unit in outputs.items()),
-        Variable("m_c", "parameter", "tunable", unit="kg", start=1.0),
+        *(Variable(p.name, "parameter", "tunable", unit=p.unit, start=p.value) for p in PLANT.parameters),
     )
 
 

@@ -122,7 +122,7 @@ def test_a_right_study_has_no_problem(tmp_path):
         ("components.plant.start.b_m: {min: 2, max: 1}", "expected min < max, found min 2 and max 1"),
         (
             "components.plant.start.b_m: {}",
-            "nothing says how this is distributed; give one of the keys relative,",
+            "nothing says how this is distributed; give one of the keys",
         ),
         ("components.plant.start.b_m: {relatve: 0.1}", "unknown key 'relatve'; did you mean 'relative'?"),
     ],
