@@ -270,6 +270,9 @@ class FmuComponent(Component):
             code = self._stepper.step(t, h)
         except (Refused, Stopped) as problem:
             return self._trouble(problem)
+        if self._stepper.remark:
+            self.message, self._stepper.remark = self._stepper.remark, ""
+            return Status.WARNING
         return Status.OK if code == 0 else self._check("DoStep", code)
 
     @property

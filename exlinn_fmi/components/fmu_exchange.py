@@ -64,9 +64,6 @@ class ModelExchange(Stepper):
         solver: one of `SOLVERS`; ``auto`` begins with ``dopri5`` and goes on with ``radau`` where the model
             proves stiff.
         tolerance: relative tolerance; absolute ones are this times the states' nominal values.
-
-    Attributes:
-        remark: what the user should know of the integration, "" where there is nothing.
     """
 
     has_events = True
@@ -75,7 +72,6 @@ class ModelExchange(Stepper):
         self._instance, self._choice, self._tolerance = instance, solver, tolerance
         self._events = EventMode(instance, "EnterContinuousTimeMode")
         self._stale = False
-        self.remark = ""
 
     # ── stepping ─────────────────────────────────────────────────────────────────────────────────────────
 

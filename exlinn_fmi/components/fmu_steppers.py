@@ -18,9 +18,11 @@ class Stepper(ABC):
 
     Attributes:
         has_events: whether discrete inputs and tunable parameters are set in Event Mode alone.
+        remark: what the user should know of the step just made, "" where there is nothing.
     """
 
     has_events = False
+    remark = ""
 
     @abstractmethod
     def begin(self, t: float) -> None:

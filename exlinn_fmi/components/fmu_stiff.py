@@ -41,6 +41,8 @@ class ScipySolver(Solver):
             return self._integrate(end)
         except _FmuFailed as failed:
             return failed.code
+        except ValueError:  # what SciPy's linear algebra makes of derivatives that are not finite
+            return compiled.NO_PROGRESS
 
     def _integrate(self, end: float) -> int:
         m = self.model
@@ -53,7 +55,7 @@ class ScipySolver(Solver):
         for _ in range(int(compiled.MOST_STEPS)):
             before = float(solver.t)
             solver.step()
-            if solver.status == "failed":
+            if solver.status == "failed" or not np.isfinite(solver.y).all():
                 return compiled.NO_PROGRESS
             m.clock[compiled.STEPS] += 1
             now, x, event = float(solver.t), solver.y, False
