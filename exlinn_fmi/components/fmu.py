@@ -10,26 +10,25 @@ import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
 from exlinn_fmi.components.cache import Lease
+from exlinn_fmi.components.fmu_calls import FmuNative
 from exlinn_fmi.components.fmu_description import FmuDescription, Kind
 from exlinn_fmi.components.fmu_events import Stopped
 from exlinn_fmi.components.fmu_file import check_runnable, read_description, unpack
 from exlinn_fmi.components.fmu_native import (
     Instance,
     Refused,
-    address,
     reference_buffer,
-    value_buffer,
 )
 from exlinn_fmi.components.fmu_steppers import EventedStep, OwnStep, Stepper
-from exlinn_fmi.components.fmu_values import TEXTS, Group, by_call, groups, start_arrays
+from exlinn_fmi.components.fmu_values import TEXTS, Group, groups, start_arrays
 from exlinn_fmi.components.fmu_versions import Instance3, make_instance
-from exlinn_fmi.components.native import Native, NativeAccess
+from exlinn_fmi.components.native import Native
 from exlinn_fmi.components.starts import check_starts, takes_start
 from exlinn_fmi.errors import ComponentError, InputError
 
@@ -258,6 +257,11 @@ class FmuComponent(Component):
         tunable = variable.causality == "parameter" and variable.variability == "tunable"
         return tunable or variable.causality == "input"
 
+    @property
+    def stepper(self) -> Stepper:
+        """What carries it over a step."""
+        return self._stepper
+
     # ── stepping ─────────────────────────────────────────────────────────────────────────────────────────
 
     def step(self, t: float, h: float) -> Status:
@@ -269,7 +273,7 @@ class FmuComponent(Component):
         try:
             code = self._stepper.step(t, h)
         except (Refused, Stopped) as problem:
-            return self._trouble(problem)
+            return self.take_trouble(problem)
         if self._stepper.remark:
             self.message, self._stepper.remark = self._stepper.remark, ""
             return Status.WARNING
@@ -324,7 +328,7 @@ class FmuComponent(Component):
         try:
             self._instance.directional_derivative(of, to, np.ascontiguousarray(seed, dtype=float), result)
         except Refused as problem:
-            self._trouble(problem)
+            self.take_trouble(problem)
             raise ComponentError(self.name, self.message) from problem
         return result
 
@@ -335,33 +339,9 @@ class FmuComponent(Component):
     def native(self) -> Native | None:
         """The FMU's own functions, where a step is one of them and no texts or binaries may travel."""
         texts = any(v.type in TEXTS and v.causality in ("input", "output") for v in self.variables)
-        return None if texts or not isinstance(self._stepper, OwnStep) else _FmuNative(self)
-
-    def calls(self, verb: Literal["Get", "Set"], indices: Indices) -> list[NativeAccess]:
-        """The C calls that get or set these variables, one per type."""
-        found = []
-        for (accessor, array), positions in by_call(self.description, indices).items():
-            whole = None if array is None else self._arrays[accessor, array]
-            references = self._references(indices[positions] if array is None else indices[positions[:1]])
-            buffer = value_buffer(self.description, accessor, 0)
-            function, arguments = self._instance.accessor(verb, accessor, references, buffer)
-            found.append(
-                NativeAccess(
-                    name=f"{verb}{accessor}",
-                    function=address(function),
-                    handle=arguments[0],
-                    references=references,
-                    dtype=buffer.dtype,
-                    boolean=accessor == "Boolean",
-                    counted=len(arguments) > 4,
-                    positions=np.array(positions, dtype=np.intp),
-                    array=whole if verb == "Set" or whole is None else whole.copy(),
-                    elements=np.array([self.description.elements[k] for k in indices[positions]])
-                    if array is not None
-                    else None,
-                )
-            )
-        return found
+        if texts or not isinstance(self._stepper, OwnStep):
+            return None
+        return FmuNative(self.description, self._instance, self._arrays, self._check)
 
     # ── state ────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -414,7 +394,7 @@ class FmuComponent(Component):
         try:
             return self._instance.serialize(state.pointer)
         except Refused as problem:
-            self._trouble(problem)
+            self.take_trouble(problem)
             raise ComponentError(self.name, f"serialising the state failed: {self.message}") from problem
 
     def deserialize_state(self, data: bytes) -> object:
@@ -426,7 +406,7 @@ class FmuComponent(Component):
         try:
             pointer = self._instance.deserialize(data)
         except Refused as problem:
-            self._trouble(problem)
+            self.take_trouble(problem)
             raise ComponentError(self.name, f"deserialising the state failed: {self.message}") from problem
         return _SavedState(self._instance, self._stepper.snapshot(), self._held.copy(), pointer)
 
@@ -442,10 +422,10 @@ class FmuComponent(Component):
         try:
             action()
         except (Refused, Stopped) as problem:
-            return self._trouble(problem)
+            return self.take_trouble(problem)
         return Status.OK
 
-    def _trouble(self, problem: Refused | Stopped) -> Status:
+    def take_trouble(self, problem: Refused | Stopped) -> Status:
         """What went wrong as a status, with a message."""
         if isinstance(problem, Refused):
             return self._check(problem.function, problem.code)
@@ -479,22 +459,6 @@ class _Plan:
     groups: list[Group]
     eventful: list[Group]
     discrete: Indices
-
-
-class _FmuNative(Native):
-    """An FMU's C functions and what to make of their codes."""
-
-    def __init__(self, component: FmuComponent) -> None:
-        self._component = component
-        self.step = component._instance.native_step()
-
-    def access(self, verb: Literal["Get", "Set"], indices: Indices) -> list[NativeAccess]:
-        return self._component.calls(verb, indices)
-
-    def heed(self, function: str, code: int) -> Status:
-        if function == "DoStep":
-            code = self._component._instance.outcome(code)
-        return self._component._check(function, code)
 
 
 class _SavedState:

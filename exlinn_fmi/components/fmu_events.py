@@ -33,8 +33,8 @@ class Stopped(Exception):  # noqa: N818 - a reason, on its way to becoming a mes
 
 
 def close(a: float, b: float) -> bool:
-    """Whether two times are the same but for rounding."""
-    return abs(a - b) <= CLOSE * max(1.0, abs(a))
+    """Whether two times are the same but for rounding; either may be infinite."""
+    return abs(a - b) <= CLOSE * max(1.0, min(abs(a), abs(b)))
 
 
 @dataclass(frozen=True)

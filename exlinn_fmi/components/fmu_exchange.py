@@ -123,6 +123,39 @@ class ModelExchange(Stepper):
         self._drop_derivatives()
         return 0
 
+    def follow(self, references: Any, knots: Values, values: Values, outputs: Any, grid: Values) -> Values:
+        """Integrate from the start along inputs that are straight between knots, all in compiled code.
+
+        Args:
+            references: (k,) value references of the inputs.
+            knots: [s] (q,) ascending, from the present time on; the last is where to.
+            values: [input units] (q, k) inputs at the knots.
+            outputs: (p,) value references of continuous outputs.
+            grid: [s] (r,) ascending times after the present one, none beyond the last knot.
+
+        Returns:
+            (r, p) outputs at the times of the grid, interpolated as precisely as the solver integrates.
+
+        Raises:
+            Refused: the FMU reports an error.
+            Stopped: it asks to end, or it cannot be integrated.
+        """
+        table, at = np.zeros((len(grid), len(outputs))), np.zeros(2, dtype=np.int64)
+        self.model.vary(references, values[0], np.zeros(len(references)))
+        self.model.sample(outputs)
+        while True:
+            until = self._events.next_event
+            code = compiled.follow(*self.model.arrays, until, knots, values, grid, table, at)
+            if code == compiled.STIFF:
+                self.model.clock[compiled.STIFFNESS] = -np.inf
+                continue
+            self._check(code)
+            due = until <= self.model.t or close(until, self.model.t)
+            if code != compiled.REACHED or due:
+                self._event()
+            elif at[0] == len(knots) - 1:
+                return table
+
     def _meet_stiffness(self) -> None:
         """Go on with another solver, or not mind."""
         self.model.clock[compiled.STIFFNESS] = -np.inf

@@ -113,7 +113,9 @@ class Instance(ABC):
         self.usable = True
         self.stepping = False
         self.generation = 0
+        self._model_addresses: list[int] = []
         self.pointer: int | None = None
+        self._functions: dict[tuple[Any, ...], Any] = {}
         self._fmu = self._load()
         self._do_step: Any = None
         self._outcome: tuple[int, ...] = ()
@@ -193,6 +195,7 @@ class Instance(ABC):
         # After fmi2Fatal nothing of the FMU may be called, its unloading code neither.
         if self.usable:
             self._fmu.freeLibrary()
+        self._functions.clear()
         self._fmu = self._do_step = None  # a call from now on is a TypeError, not a jump into the void
 
     def said(self, before: str = "") -> str:
@@ -209,8 +212,11 @@ class Instance(ABC):
 
     def function(self, name: str, *arguments: Any, result: Any = c_int) -> Callable[..., Any]:
         """A C function of the FMU by its name less the prefix, with these argument types."""
-        found: Any = self._fmu.dll[self.prefix + name]
-        found.argtypes, found.restype = arguments, result
+        key = name, arguments
+        found = self._functions.get(key)
+        if found is None:
+            found = self._functions[key] = self._fmu.dll[self.prefix + name]
+            found.argtypes, found.restype = arguments, result
         return found  # type: ignore[no-any-return]
 
     def call(self, name: str) -> int:
@@ -302,8 +308,9 @@ class Instance(ABC):
 
     def model_calls(self) -> list[int]:
         """`fmu_solver.Model.calls`: the instance, addresses of the functions that a solver calls, flags."""
-        addresses = [address(self.function(name)) for name in self.model_functions]
-        return [self.pointer or 0, *addresses, self.description.version, self.roll_back]
+        if not self._model_addresses:
+            self._model_addresses = [address(self.function(name)) for name in self.model_functions]
+        return [self.pointer or 0, *self._model_addresses, self.description.version, self.roll_back]
 
     # ── state ────────────────────────────────────────────────────────────────────────────────────────────
 

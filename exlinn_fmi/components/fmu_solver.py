@@ -452,7 +452,17 @@ def integrate(
 
 @njit(cache=True)
 def follow(
-    calls: Any, clock: Any, w: Any, z: Any, u: Any, knots: Any, values: Any, grid: Any, table: Any, at: Any
+    calls: Any,
+    clock: Any,
+    w: Any,
+    z: Any,
+    u: Any,
+    until: float,
+    knots: Any,
+    values: Any,
+    grid: Any,
+    table: Any,
+    at: Any,
 ) -> Any:
     """Integrate along inputs that are straight between knots, sampling outputs; stops at an event.
 
@@ -462,6 +472,7 @@ def follow(
         w: see `Model`.
         z: see `Model`.
         u: `Model.arrays` end.
+        until: [s] where to, if before the last knot.
         knots: [s] (q,) ascending; the last is where to.
         values: [input units] (q, k) inputs at the knots.
         grid: [s] (r,) ascending times at which outputs are sampled.
@@ -478,8 +489,9 @@ def follow(
             u[VALUE, j] = values[k, j]
             u[RATE, j] = (values[k + 1, j] - values[k, j]) / span
         clock[T_INPUT] = knots[k]
-        code, at[1] = integrate(calls, clock, w, z, u, knots[k + 1], grid, table, at[1])
-        if code:
+        end = min(knots[k + 1], until)
+        code, at[1] = integrate(calls, clock, w, z, u, end, grid, table, at[1])
+        if code or end < knots[k + 1]:
             return code
         at[0] = k + 1
     return REACHED

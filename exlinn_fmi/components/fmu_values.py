@@ -190,7 +190,7 @@ def start_arrays(description: FmuDescription) -> Arrays:
     arrays: Arrays = {}
     for k, variable in enumerate(description.variables):
         key = description.accessors[k], description.references[k]
-        if not is_array(description, k):
+        if description.sizes[k] <= 1:
             continue
         if key not in arrays:
             texts = key[0] in TEXTS

@@ -54,7 +54,9 @@ def test_a_bouncing_ball_flies_as_its_closed_form(opened, version: int, solver: 
     driver = opened("BouncingBall", version, "model_exchange", solver=solver, tolerance=1e-10)
     driver.begin(h=0.05, stop=4.0)
     for k in range(80):
-        assert driver.get("h", "v") == pytest.approx(ball(0.05 * k), abs=1e-6 if solver == "bdf" else 1e-7)
+        assert driver.get("h", "v") == pytest.approx(
+            ball(0.05 * k), abs=1e-6 if solver in ("bdf", "lsoda") else 1e-7
+        )
         driver.run(1)
     assert driver.get("h", "v", "g") == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
 
