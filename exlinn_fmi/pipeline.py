@@ -110,6 +110,8 @@ def train(work: Run) -> None:
     written += write_table(work.folder / "evaluation", card.evaluation, card.units)
     parameters = work.folder / "parameters.csv"
     write_text(parameters, card.parameters.to_csv(index=False))
+    written.append(work.folder / "curves.csv")
+    write_text(written[-1], card.curves.to_csv(index=False))
     if card.terms is not None:
         written.append(work.folder / "terms.csv")
         write_text(written[-1], card.terms.to_csv(index=False))

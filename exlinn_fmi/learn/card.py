@@ -15,6 +15,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
+from exlinn_fmi.learn.curves import curves
 from exlinn_fmi.learn.estimate import estimate
 from exlinn_fmi.learn.guarantee import told
 from exlinn_fmi.learn.identify import Identified, identify
@@ -47,6 +48,7 @@ class ReportCard:
             ``learn.terms`` and ``identify.objective``: what was done and why, and the formula that was found,
             as far as there is any.
         terms: the terms that were found, if the model is made of such.
+        curves: M(q), V(q), 1/C(x) and friction over velocity with 95 % bands, as `curves.curves` gives them.
     """
 
     metrics: dict[str, float]
@@ -55,6 +57,7 @@ class ReportCard:
     units: dict[str, str]
     texts: dict[str, str] = field(default_factory=dict)
     terms: pd.DataFrame | None = None
+    curves: pd.DataFrame = field(default_factory=pd.DataFrame)
 
 
 def report_card(
@@ -100,7 +103,7 @@ def report_card(
         texts |= {"learn.objective": model.provenance["objective"], "learn.terms": formula(terms)}
     evaluation, units = _evaluation(system, (tests or [train])[0])
     metrics |= _identify_metrics(found)
-    return ReportCard(metrics, found.parameters, evaluation, units, texts, terms)
+    return ReportCard(metrics, found.parameters, evaluation, units, texts, terms, curves(model, train))
 
 
 def force_error(system: LagrangianSystem, data: Dataset) -> Float[Array, "N n"]:

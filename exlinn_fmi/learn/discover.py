@@ -70,10 +70,14 @@ class Discovery:
         return np.where(kept, spread(self.fit.p, kept), np.where(self._is_shape, self.basis.start, 0))
 
     @property
+    def free(self) -> Bool[NDArray[np.bool_], " P"]:
+        """Parameters that were found: those that the covariance is of."""
+        return self.basis.kept(self.chosen) & np.isnan(self.known)
+
+    @property
     def deviations(self) -> Float[Array, " P"]:
         """Standard deviations of the parameters; 0 where pruned or held."""
-        free = self.basis.kept(self.chosen) & np.isnan(self.known)
-        return spread(np.sqrt(np.maximum(np.diag(self.fit.information.covariance), 0)), free)
+        return spread(np.sqrt(np.maximum(np.diag(self.fit.information.covariance), 0)), self.free)
 
     @property
     def _is_shape(self) -> Bool[NDArray[np.bool_], " P"]:

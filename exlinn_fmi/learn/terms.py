@@ -8,10 +8,9 @@ deviation, which goes into the model's provenance.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -35,6 +34,9 @@ from exlinn_fmi.scenario.learning import Objective, Terms
 
 Array = NDArray[np.float64]
 
+Masks = Sequence[NDArray[np.bool_]]
+
+GENERIC = Terms(preset="terms")
 STAGES = 5
 """About as many iterates does the learner give."""
 CONSISTENT = 1e-8
@@ -117,7 +119,7 @@ def iterate_terms(
     train: Dataset,
     validation: Dataset,
     objective: Objective,
-    known: Mapping[str, float] = MappingProxyType({}),
+    options: Terms = GENERIC,
 ) -> Iterator[Iterate]:
     """Train; yields after each stage of the work.
 
@@ -126,12 +128,13 @@ def iterate_terms(
         train: data to fit.
         validation: data to watch.
         objective: what to make small.
-        known: terms, and shapes, whose values are held.
+        options: the learner's settings: candidates of the user are all looked at together.
     """
     basis = spec.basis
     names = [*basis.terms, *(shape.name for shape in basis.shapes)]
-    held = np.array([known.get(name, np.nan) for name in names], dtype=float)
-    found, why = _stages(basis, train, objective, held)
+    held = np.array([options.known.get(name, np.nan) for name in names], dtype=float)
+    masks = [np.ones(basis.size, dtype=bool)] if options.lagrangian else families(basis)
+    found, why = _stages(basis, masks, train, objective, held)
     judge = prediction_error if why.startswith("trajectory") else force_misfit
     for step, now in enumerate(found):
         p, count = now.p, len(basis.lagrangian)
@@ -151,7 +154,7 @@ def iterate_terms(
 
 
 def _stages(
-    basis: MonomialBasis, data: Dataset, objective: Objective, held: Float[Array, " P"]
+    basis: MonomialBasis, masks: Masks, data: Dataset, objective: Objective, held: Float[Array, " P"]
 ) -> tuple[Iterable[Discovery], str]:
     """What is done one after the other, and why.
 
@@ -161,24 +164,25 @@ def _stages(
     if objective != "auto" or not even(data) or max(relative_noise(data).values()) > CLEAN:
         chosen, why = choose(objective, basis, data)
         if chosen != "trajectory":
-            return _least_squares(basis, data, chosen, held), why
-        return discover(*narrow(basis, data, "weak", held), data, held), why
-    stages = list(_least_squares(basis, data, "inverse", held))
+            return _least_squares(basis, masks, data, chosen, held), why
+        return discover(*narrow(basis, masks, data, "weak", held), data, held), why
+    stages = list(_least_squares(basis, masks, data, "inverse", held))
     misfit = np.sqrt(force_misfit(stages[-1].basis, stages[-1].p, data))
     if misfit > CONSISTENT:
-        *_, weak = _least_squares(basis, data, "weak", held)
+        *_, weak = _least_squares(basis, masks, data, "weak", held)
         if weak_regression(weak.basis, data, weak.p).misfit(weak.p) < RESOLVED:
             return discover(weak.basis, weak.chosen, data, held), _doubt(misfit)
     return stages, "inverse: the states are clean and the accelerations do not contradict them"
 
 
 def narrow(
-    basis: MonomialBasis, data: Dataset, objective: Objective, known: Float[Array, " P"]
+    basis: MonomialBasis, masks: Masks, data: Dataset, objective: Objective, known: Float[Array, " P"]
 ) -> tuple[MonomialBasis, NDArray[np.bool_]]:
     """The family of terms that explains the data best for its size, by the same criterion as single terms.
 
     Args:
-        basis: generic terms.
+        basis: all terms.
+        masks: families of them that are tried, the richest last.
         data: what they are to explain.
         objective: ``inverse`` or ``weak``.
         known: parameters that are held, NaN for the others.
@@ -186,14 +190,13 @@ def narrow(
     Returns:
         The basis with the shapes of that family's rational functions as they were found, and the family.
     """
-    masks = families(basis)
     if len(masks) == 1:
         return basis, masks[0]
     if objective == "inverse":
         every = -(-len(data) // COARSE)
         data = Dataset(data.frame[::every], data.coordinates)
     best, found, family = np.inf, basis, masks[-1]
-    lengths = np.array([s.name.startswith(("a_", "h_")) for s in basis.shapes])
+    lengths = np.array([s.name.startswith(("a_", "h_")) for s in basis.shapes], dtype=bool)
     for mask in masks[:-1]:
         part, kept = basis.only(mask), basis.kept(mask)
         make, windows = regress(part, data, objective)
@@ -214,12 +217,13 @@ def narrow(
 
 def _least_squares(
     basis: MonomialBasis,
+    masks: Masks,
     data: Dataset,
     objective: Objective,
     known: Float[Array, " P"],
 ) -> Iterator[Discovery]:
     """Least squares on a family of terms, and on those that pruning leaves."""
-    basis, first = narrow(basis, data, objective, known)
+    basis, first = narrow(basis, masks, data, objective, known)
 
     def fit(part: MonomialBasis, held: Float[Array, " P"], last: Fit | None) -> Fit:
         make, windows = regress(part, data, objective)
@@ -292,7 +296,16 @@ def prediction_error(basis: MonomialBasis, p: Float[Array, " P"], data: Dataset)
 
 def _notes(basis: MonomialBasis, found: Discovery, why: str, data: Dataset) -> dict[str, Any]:
     """Provenance: the objective and its reason, noise, and the terms with their deviations."""
-    return {"objective": why, "noise": relative_noise(data), "deviations": found.deviations.tolist()}
+    covariance = {
+        "of": np.flatnonzero(found.free).tolist(),
+        "matrix": found.fit.information.covariance.tolist(),
+    }
+    return {
+        "objective": why,
+        "noise": relative_noise(data),
+        "deviations": found.deviations.tolist(),
+        "covariance": covariance,
+    }
 
 
 def term_table(spec: ModelSpec, p: Float[Array, " P"], deviations: Float[Array, " P"]) -> pd.DataFrame:

@@ -159,7 +159,7 @@ def _learner(
         from exlinn_fmi.learn.terms import STAGES, iterate_terms, terms_spec
 
         spec = terms_spec(train, method, structure)
-        return spec, iterate_terms(spec, train, validation, objective, method.known), STAGES
+        return spec, iterate_terms(spec, train, validation, objective, method), STAGES
     from exlinn_fmi.learn.structured import iterate_structured, structured_spec
 
     spec, start = structured_spec(train, method, seed, structure)

@@ -13,7 +13,7 @@ from exlinn_fmi.results.metrics import Loop, control_loops
 from exlinn_fmi.results.panels import Chart, Line, Panel, Role, extremes
 from exlinn_fmi.results.robustness import study_charts
 from exlinn_fmi.results.tables import LEARNED, RunFiles, Table
-from exlinn_fmi.results.typography import readable, typeset, words
+from exlinn_fmi.results.typography import axis_label, readable, typeset, words
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,6 +42,8 @@ def charts(run: RunFiles) -> list[Chart]:
     made: list[Chart | None] = []
     if run.evaluation is not None:
         made.append(learning_chart(run.evaluation))
+    if run.curves is not None:
+        made += curve_charts(run.curves)
     if run.training is not None:
         made.append(training_chart(run.training))
     if run.trajectories is not None:
@@ -77,6 +79,31 @@ def learning_chart(evaluation: Table) -> Chart | None:
     if not panels:
         return None
     return Chart("fig3_learning", "Learned model against measurement on the unseen test", tuple(panels))
+
+
+def curve_charts(curves: pd.DataFrame) -> list[Chart]:
+    """Functions that the model holds, with 95 % bands: a chart for each position and velocity."""
+    made = []
+    for variable, part in curves.groupby("variable", sort=False):
+        panels = []
+        for name, curve in part.groupby("curve", sort=False):
+            x = _values(curve, "at")
+            lines = [Line("learned", x, _values(curve, "value"), "model")]
+            lines += [
+                Line(label, x, _values(curve, side), "bound")
+                for label, side in (("95 %", "low"), ("", "high"))
+                if curve[side].notna().any()
+            ]
+            panels.append(Panel(str(name), _text(curve["unit"].iloc[0]), tuple(lines)))
+        label = axis_label(str(variable), _text(part["variable_unit"].iloc[0]))
+        title = f"What the model holds over {variable}"
+        made.append(Chart(f"curves_{variable}", title, tuple(panels), x_label=label))
+    return made
+
+
+def _text(cell: object) -> str:
+    """A cell of a CSV file that may be empty."""
+    return cell if isinstance(cell, str) else ""
 
 
 def training_chart(history: pd.DataFrame) -> Chart | None:

@@ -24,11 +24,12 @@ TEMPLATE = Path(__file__).with_name("page.html")
 SECTION_OF = {
     "fig3_learning": "learning",
     "training": "learning",
+    "curves": "learning",
     "trajectories": "trajectories",
     "study_runs": "study",
     "study_causes": "study",
 }
-"""Which section a chart belongs to; those of controllers belong to `control`."""
+"""Which section a chart belongs to, curves of all variables alike; those of controllers to `control`."""
 WORST = 5
 """How many of the worst runs of a study are listed."""
 
@@ -145,7 +146,8 @@ def _charts(drawn: Iterable[Chart], section: str) -> str:
     """Places for the charts of a section, which the script at the end of the page fills."""
     html = []
     for chart in drawn:
-        if SECTION_OF.get(chart.name, "control") == section:
+        kind = chart.name.split("_")[0] if chart.name.startswith("curves_") else chart.name
+        if SECTION_OF.get(kind, "control") == section:
             note = f'<p class="note">{escape(chart.note)}</p>' if chart.note else ""
             place = f'<div class="chart" id="{_chart_id(chart)}"></div>'
             html.append(f"<figure><h3>{escape(chart.title)}</h3>{place}{note}</figure>")

@@ -51,6 +51,7 @@ class RunFiles:
         evaluation: measured (``name``) against learned (``name_learned``) on the first unseen test.
         training: loss over iterations.
         parameters: identified parameters with their true values.
+        curves: functions of position and velocity that the model holds, with 95 % bands.
         trajectories: what the co-simulation recorded.
         study: one row for each run of a robustness study.
         metrics: value (or text) by flat key, None where it was not finite.
@@ -63,6 +64,7 @@ class RunFiles:
     evaluation: Table | None = None
     training: pd.DataFrame | None = None
     parameters: pd.DataFrame | None = None
+    curves: pd.DataFrame | None = None
     trajectories: Table | None = None
     study: pd.DataFrame | None = None
     metrics: Mapping[str, float | str | None] = field(default_factory=dict)
@@ -93,6 +95,7 @@ def read_run(folder: Path) -> RunFiles:
         evaluation=_table(folder / "evaluation"),
         training=_csv(folder / "training.csv"),
         parameters=_csv(folder / "parameters.csv"),
+        curves=_csv(folder / "curves.csv"),
         trajectories=_table(folder / "trajectories"),
         study=_csv(folder / "study.csv"),
         metrics=_json(folder / "metrics.json"),

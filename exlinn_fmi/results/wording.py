@@ -32,6 +32,7 @@ WORDING = (
     (r"learn\.noise_(.+)", "Noise of {0}, relative to the signal", ""),
     (r"learn\.objective", "What was made small, and why", ""),
     (r"learn\.terms", "Terms found", ""),
+    (r"learn\.guarantee", "Whether it stays bounded under bounded inputs", ""),
     (r"identify\.objective", "How the parameters were found, and why", ""),
     (r"identify\.max_rel_error", "Largest relative error of an identified parameter", ""),
     (r"identify\.misfit", "What the identified parameters leave unexplained", ""),
