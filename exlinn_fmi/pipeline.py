@@ -176,6 +176,8 @@ def simulate(work: Run, resume: bool = False) -> None:
     began = time.perf_counter()
     components = {name: work.component(name) for name in scenario.components}
     for name, component in components.items():
+        for note in component.notes:
+            work.reporter.note(f"{name}: {note}")
         for warning in component.warnings:
             work.warn(f"{name}: {warning}")
     if scenario.events:

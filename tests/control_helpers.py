@@ -96,11 +96,12 @@ def generator(
 
 
 def problem(system: LagrangianSystem, kind: str = "sqp", **options: Any) -> tuple[Solver, ReferenceGenerator]:
-    """A solver with its references."""
+    """A solver with its references; the backend may follow the kind, as in `sqp/casadi`."""
+    kind, _, backend = kind.partition("/")
     settings = Nmpc(**({"reference": CART} | options))
     made = generator(system, settings.reference, settings.horizon or 30)
     ocp = Ocp(system, settings, STEP, made.states)
-    return make_solver(ocp, kind, settings.iterations, settings.tolerance), made
+    return make_solver(ocp, kind, settings.iterations, settings.tolerance, backend or "auto"), made
 
 
 def controller(system: LagrangianSystem | None = None, step: float = STEP, **options: Any) -> NmpcController:

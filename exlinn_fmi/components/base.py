@@ -96,12 +96,14 @@ class Component(ABC):
         name: name in the scenario.
         variables: all variables; an index into this tuple addresses one.
         message: what the component last said of a status other than OK.
+        notes: what is worth a line in the log, e.g. a choice that was made for the user.
         warnings: what the user should know before a run, e.g. of settings that do not fit together.
     """
 
     name: str
     variables: tuple[Variable, ...]
     message: str = ""
+    notes: Sequence[str] = ()
     warnings: Sequence[str] = ()
 
     @property

@@ -121,7 +121,9 @@ class NmpcController(Component):
             generator = ReferenceGenerator(system, options.reference, folder, step, self._ocp.horizon)
         self._generator = generator
         self._late, self._slow = options.delay != "none", options.delay == "computation"
-        self._solver = make_solver(self._ocp, options.solver, options.iterations, options.tolerance)
+        self._solver = make_solver(
+            self._ocp, options.solver, options.iterations, options.tolerance, options.backend
+        )
         self._step = step
         safe = np.array([options.safe_input.get(key, 0.0) for key in system.input_names])
         self._safe: NDArray[np.float64] = np.clip(safe, self._ocp.limits.u_min, self._ocp.limits.u_max)
@@ -131,6 +133,9 @@ class NmpcController(Component):
         self._memory = _Memory()
         self._following: _Memory | None = None
         self.warnings = diagnose(self._ocp, self._generator, first, self._estimator)
+        self.notes = (f"solver backend: {self._solver.backend}",)
+        if self._solver.reason:
+            self.warnings += (f"the solver is not compiled, and far slower: {self._solver.reason}",)
 
     @property
     def sampled(self) -> bool:
@@ -220,7 +225,9 @@ class NmpcController(Component):
         time = memory.time + (self._step if self._slow else 0.0)
         references = self._generator.over(time, state, branch, memory.references, force)
         unknown = np.full(self._ocp.n, np.nan)
-        solution = self._solver.solve(unknown if ahead is None else state, references, memory.plan)
+        solution = self._solver.solve(
+            unknown if ahead is None else state, references, memory.plan, memory.applied
+        )
         message = "; ".join(text for text in (self._missing(), solution.stats.message) if text)
         if solution.status == SolveStatus.FAILED:
             u, following, action = self._fall_back(memory, references)

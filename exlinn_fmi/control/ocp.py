@@ -59,6 +59,7 @@ class Targets:
         P: terminal weight, shape (n, n).
         riccati: whether P solves the Riccati equation.
         force: constant generalised force on each coordinate besides the inputs, shape (coordinates,).
+        applied: the input applied last, shape (m,), None where there is none or where rates are not bounded.
     """
 
     x: NDArray[np.float64]
@@ -66,6 +67,7 @@ class Targets:
     P: NDArray[np.float64]
     riccati: bool
     force: NDArray[np.float64]
+    applied: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,7 @@ class Limits:
     Args:
         u_min: inputs, shape (m,).
         u_max: inputs, shape (m,).
+        u_step: largest change of the inputs from one interval to the next, shape (m,).
         soft: indices of the states that are bounded, shape (s,).
         x_min: their bounds less the back-off, shape (s,).
         x_max: their bounds less the back-off, shape (s,).
@@ -98,10 +101,16 @@ class Limits:
 
     u_min: NDArray[np.float64]
     u_max: NDArray[np.float64]
+    u_step: NDArray[np.float64]
     soft: NDArray[np.intp]
     x_min: NDArray[np.float64]
     x_max: NDArray[np.float64]
     span: NDArray[np.float64]
+
+    @property
+    def rated(self) -> bool:
+        """Whether any input's rate is bounded."""
+        return bool(np.isfinite(self.u_step).any())
 
 
 class Ocp:
@@ -135,15 +144,16 @@ class Ocp:
         self.Q = np.diag(_numbers("weights.states", q, system.state_names, chosen))
         self.R = np.diag(_numbers("weights.inputs", r, system.input_names, np.ones(self.m)))
         self.terminal = weights.terminal
-        self.limits = _limits(options, system)
+        self.limits = _limits(options, system, step)
         largest = max(self.Q.max(), self.R.max())
         self.l1 = PENALTY * largest * self.limits.span
         self.l2 = PENALTY * largest * np.ones_like(self.limits.span)
-        loaded, substeps = system.loaded(), options.substeps or 1
-        sensitivities = rk4_sensitivities(loaded, substeps)
-        self._linearise = Batch(sensitivities, self.horizon)
-        self._linearise_one = Batch(sensitivities, 1)
-        self.discrete = loaded.rk4(substeps)
+        self.substeps, loaded = options.substeps or 1, system.loaded()
+        self.sensitivities = rk4_sensitivities(loaded, self.substeps)
+        """One interval and its derivatives: (x, u, p, h) → (x⁺, ∂x⁺/∂x, ∂x⁺/∂u)."""
+        self._linearise = Batch(self.sensitivities, self.horizon)
+        self._linearise_one = Batch(self.sensitivities, 1)
+        self.discrete = loaded.rk4(self.substeps)
         """One interval of the prediction: (x, u, p, h) → x⁺, with `parameters(force)` as p."""
         self._predict = Batch(self.discrete, self.horizon)
 
@@ -176,6 +186,22 @@ class Ocp:
         """A and B of one interval at a state (n,) and input (m,)."""
         _, A, B = self._linearise_one(x, u, self.parameters(force), self.step)
         return A[0].copy(), B[0].copy()
+
+    def first_bounds(
+        self, applied: Float[np.ndarray, " m"] | None
+    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """Bounds of the first input: what its rate allows after the last one, but never beyond its own.
+
+        Args:
+            applied: the last input, shape (m,); None where none has been applied.
+        """
+        lim = self.limits
+        if applied is None:
+            return lim.u_min, lim.u_max
+        return (
+            np.clip(applied - lim.u_step, lim.u_min, lim.u_max),
+            np.clip(applied + lim.u_step, lim.u_min, lim.u_max),
+        )
 
     def targets(self, references: References) -> Targets:
         """What to aim at: the references within bounds, and the terminal cost at the horizon's end.
@@ -297,9 +323,11 @@ def check_names(key: str, given: Iterable[str], names: list[str], kind: str) -> 
             raise ModelError(f"{key}: the model has no {name!r}; {nearest(name, names, kind)}")
 
 
-def _limits(options: Nmpc, system: LagrangianSystem) -> Limits:
+def _limits(options: Nmpc, system: LagrangianSystem, step: float) -> Limits:
     """Bounds as arrays."""
     u_min, u_max = _bounds("inputs", options.inputs, system.input_names)
+    check_names("rates", options.rates, system.input_names, "inputs")
+    u_step = step * np.array([options.rates.get(name, np.inf) for name in system.input_names])
     x_min, x_max = _bounds("states", options.states, system.state_names)
     soft: Int[np.ndarray, " s"] = np.flatnonzero(np.isfinite(x_min) | np.isfinite(x_max))
     low, high = x_min[soft], x_max[soft]
@@ -308,7 +336,7 @@ def _limits(options: Nmpc, system: LagrangianSystem) -> Limits:
     with np.errstate(invalid="ignore"):
         span = np.where(both, (high - low) / 2, one)
     span[span == 0.0] = 1.0
-    return Limits(u_min, u_max, soft, low + BACK_OFF * span, high - BACK_OFF * span, span)
+    return Limits(u_min, u_max, u_step, soft, low + BACK_OFF * span, high - BACK_OFF * span, span)
 
 
 def _bounds(

@@ -6,7 +6,9 @@ In steps dx_k = x_k − x̄_k, du_k = u_k − ū_k and slacks s_k of the softene
     subject to dx_{k+1} = A_k dx_k + B_k du_k + c_k, dx_0 given, du within bounds,
                low_k − s_k ≤ dx_{k+1} ≤ high_k + s_k (bounded states), s_k ≥ 0.
 
-It is always feasible. Solvers differ in how they use the stages, not in what they return.
+With bounds on the inputs' rate the last m entries of the state are the inputs of the stage before, and du_k
+less these is within bounds as well. It is always feasible. Solvers differ in how they use the stages, not in
+what they return.
 """
 
 from __future__ import annotations
@@ -56,6 +58,8 @@ class StageQp:
         high: bounds of their dx at nodes 1 … N, shape (N, s).
         l1: linear penalty, shape (s,).
         l2: quadratic penalty, shape (s,).
+        rate_low: bounds of du_k − du_{k−1} from the second stage on, shape (N − 1, m); None for no bounds.
+        rate_high: the same from above.
     """
 
     A: NDArray[np.float64]
@@ -73,6 +77,8 @@ class StageQp:
     high: NDArray[np.float64]
     l1: NDArray[np.float64]
     l2: NDArray[np.float64]
+    rate_low: NDArray[np.float64] | None = None
+    rate_high: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -116,6 +122,7 @@ class ConicQp(QpSolver):
         n: number of states.
         m: number of inputs.
         soft: indices of the softened states, shape (s,).
+        rated: whether the inputs' rate is bounded.
         largest: programs whose Hessian is larger than this are scaled down to it; rounding errors grow with
             it, and may not exceed the residuals that are asked for.
 
@@ -124,12 +131,19 @@ class ConicQp(QpSolver):
     """
 
     def __init__(
-        self, plugin: str, N: int, n: int, m: int, soft: Int[np.ndarray, " s"], largest: float = LARGE
+        self,
+        plugin: str,
+        N: int,
+        n: int,
+        m: int,
+        soft: Int[np.ndarray, " s"],
+        rated: bool = False,
+        largest: float = LARGE,
     ) -> None:
         self.plugin, self._largest = plugin, largest
         s = len(soft)
         self._soft = soft
-        self._layout = layout = _Layout(N, n, m, soft)
+        self._layout = layout = _Layout(N, n, m, soft, rated)
         options: dict[str, Any] = {"error_on_fail": False}
         if plugin == "hpipm":
             residuals = dict.fromkeys(("res_g_max", "res_b_max", "res_d_max", "res_m_max"), TOLERANCE)
@@ -137,7 +151,7 @@ class ConicQp(QpSolver):
                 "N": N,
                 "nx": [0] + [n] * N,
                 "nu": [m + s] * N + [0],
-                "ng": [2 * s] * N + [0],
+                "ng": [2 * s + m * rated] * N + [0],
                 "inf": INFINITE,
                 "hpipm": {"mode": "balance", "iter_max": 60} | residuals,
             }
@@ -175,6 +189,9 @@ class ConicQp(QpSolver):
         # The rows hold A dx + B du ± s, what is missing to dx_{k+1} is the constant.
         put["lba"][at.above], put["uba"][at.above] = -np.inf, qp.high - constant[:, self._soft]
         put["lba"][at.below], put["uba"][at.below] = qp.low - constant[:, self._soft], np.inf
+        if qp.rate_low is not None:
+            put["lba"][at.rate[1:]], put["uba"][at.rate[1:]] = qp.rate_low, qp.rate_high
+            put["lba"][at.rate[:1]], put["uba"][at.rate[:1]] = -np.inf, np.inf
         for cold in ("x0", "lam_x0", "lam_a0"):
             put[cold][:] = 0.0
         for i, view in enumerate(self._views):
@@ -227,7 +244,7 @@ class FallbackQp(QpSolver):
         return solution
 
 
-def make_qp_solver(N: int, n: int, m: int, soft: Int[np.ndarray, " s"]) -> QpSolver:
+def make_qp_solver(N: int, n: int, m: int, soft: Int[np.ndarray, " s"], rated: bool = False) -> QpSolver:
     """The best solver that this CasADi has: hpipm, less exact hpipm, qrqp in this order, or qrqp alone.
 
     Args:
@@ -235,11 +252,12 @@ def make_qp_solver(N: int, n: int, m: int, soft: Int[np.ndarray, " s"]) -> QpSol
         n: number of states.
         m: number of inputs.
         soft: indices of the softened states, shape (s,).
+        rated: whether the inputs' rate is bounded.
     """
-    sparse = ConicQp("qrqp", N, n, m, soft, ROUGH)
+    sparse = ConicQp("qrqp", N, n, m, soft, rated, ROUGH)
     if not ca.has_conic("hpipm"):
         return sparse
-    return FallbackQp(*(ConicQp("hpipm", N, n, m, soft, size) for size in (LARGE, ROUGH)), sparse)
+    return FallbackQp(*(ConicQp("hpipm", N, n, m, soft, rated, size) for size in (LARGE, ROUGH)), sparse)
 
 
 @dataclass(frozen=True)
@@ -292,16 +310,17 @@ class _Entries:
 class _Layout:
     """Where everything is: places of variables and constraints, patterns of H and A."""
 
-    def __init__(self, N: int, n: int, m: int, soft: NDArray[np.intp]) -> None:
-        s = len(soft)
-        self._width = N * (m + s + n)
-        first, row = np.arange(N)[:, None] * (m + s + n), np.arange(N)[:, None] * (n + 2 * s)
+    def __init__(self, N: int, n: int, m: int, soft: NDArray[np.intp], rated: bool) -> None:
+        s, rates = len(soft), m * rated
+        self._width, self._height = N * (m + s + n), N * (n + 2 * s + rates)
+        first, row = np.arange(N)[:, None] * (m + s + n), np.arange(N)[:, None] * (n + 2 * s + rates)
         self.u = first + np.arange(m)
         self.s = first + m + np.arange(s)
         self.x = first + m + s + np.arange(n)  # x_1 … x_N
         self.gap = row + np.arange(n)
         self.above = row + n + np.arange(s)
         self.below = row + n + s + np.arange(s)
+        self.rate = row + n + 2 * s + np.arange(rates)
         self.h = self._hessian(n, m, s)
         self.a = self._constraints(n, m, soft)
 
@@ -332,4 +351,8 @@ class _Layout:
             entries.diagonal(self.gap[k], self.x[k], plus + 1)
             entries.diagonal(self.above[k], self.s[k], plus + 1)
             entries.diagonal(self.below[k], self.s[k], plus)
-        return entries.pattern(N * (n + 2 * len(soft)), self._width)
+            if self.rate.size:
+                entries.diagonal(self.rate[k], self.u[k], plus)
+                if k:
+                    entries.diagonal(self.rate[k], self.x[k - 1, n - m :], plus + 1)
+        return entries.pattern(self._height, self._width)

@@ -58,6 +58,9 @@ class ScaledQp(QpSolver):
     def solve(self, qp: StageQp) -> QpSolution:
         """Solve."""
         x, u = units(qp.H_end, qp.H_u, qp.B[-1])
+        rated = qp.rate_low is not None and qp.rate_high is not None
+        if rated:  # the last inputs, which stand among the states, are counted as the inputs are
+            x[-len(u) :] = u
         s, column = x[self._soft], x[:, None]
         scaled = replace(
             qp,
@@ -76,6 +79,8 @@ class ScaledQp(QpSolver):
             high=qp.high / s,
             l1=qp.l1 * s,
             l2=qp.l2 * s**2,
+            rate_low=qp.rate_low / u if rated else None,
+            rate_high=qp.rate_high / u if rated else None,
         )
         found = self.inner.solve(scaled)
         return replace(found, dx=found.dx * x, du=found.du * u, slack=found.slack * s)

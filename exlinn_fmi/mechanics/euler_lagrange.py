@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -27,6 +27,9 @@ from exlinn_fmi.mechanics.coordinates import (
     input_names,
     state_names,
 )
+
+if TYPE_CHECKING:
+    from exlinn_fmi.mechanics.learned import Networks
 
 Symbol = Any
 """A CasADi expression; CasADi ships no type information."""
@@ -60,12 +63,14 @@ class LagrangianSystem:
         lagrangian: (q, v, p) → 𝓛 [J].
         dissipation: (v, p) → D [W], Rayleigh's dissipation function.
         parameters: with their default values, in the order of p.
+        networks: where 𝓛 and D are networks, these, for who evaluates them without CasADi.
     """
 
     coordinates: tuple[Coordinate, ...]
     lagrangian: ca.Function
     dissipation: ca.Function
     parameters: tuple[Parameter, ...] = ()
+    networks: Networks | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def build(

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -189,6 +189,14 @@ def _with_tuples(data: Mapping[str, Any]) -> dict[str, Any]:
     return {key: tuples(value) for key, value in data.items()}
 
 
+@dataclass(frozen=True)
+class Networks:
+    """A structured model: description and weights."""
+
+    spec: ModelSpec
+    weights: Weights
+
+
 def angular(coordinate: Coordinate) -> float:
     """Factor from the unit of an angle to rad."""
     return 2 * np.pi / TURN.get(coordinate.unit, TURN["rad"])
@@ -217,11 +225,12 @@ def learned_system(spec: ModelSpec, weights: Weights) -> LagrangianSystem:
             lambda q, v, p: _relu_network(weights, "lagrangian", basis.expressions(q, v)[0]),
             lambda v, p: _relu_network(weights, "dissipation", basis.expressions(0 * v, v)[1]),
         )
-    return LagrangianSystem.build(
+    system = LagrangianSystem.build(
         spec.coordinates,
         lambda q, v, p: structured_lagrangian(spec, weights, q, v),
         lambda v, p: structured_dissipation(spec, weights, v),
     )
+    return replace(system, networks=Networks(spec, weights))
 
 
 def check_weights(spec: ModelSpec, weights: Weights) -> None:

@@ -134,6 +134,9 @@ class Nmpc(Spec):
     states: dict[str, Bounds] = Field(
         default_factory=dict, description="bounds on states, by name (softened)"
     )
+    rates: dict[str, Positive] = Field(
+        default_factory=dict, description="largest rate of change of inputs, per second, by name"
+    )
     solver: Literal["rti", "sqp", "ipopt"] = Field(
         "rti", description="`rti`: one QP a step; `sqp`: until converged; `ipopt`: interior point"
     )
@@ -144,6 +147,11 @@ class Nmpc(Spec):
         ge=1,
         le=100,
         description="RK4 steps in one interval; from the model's fastest pole if not given",
+    )
+    backend: Literal["auto", "compiled", "casadi"] = Field(
+        "auto",
+        description="what computes `rti` and `sqp`: C compiled on this machine, or CasADi; `auto`: compiled "
+        "where there is a C compiler",
     )
     estimator: Annotated[
         Annotated[EstimatorKind, Tag("text")] | Annotated[Estimator, Tag("a mapping")], Discriminator(form)

@@ -17,7 +17,9 @@ from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate
 from exlinn_fmi.scenario.control import Weights
 from exlinn_fmi.scenario.spec import Bounds
 
-KINDS = ["rti", "sqp", "ipopt"]
+BACKENDS = ["compiled", "casadi"]
+SQP = [f"sqp/{backend}" for backend in BACKENDS]
+KINDS = [*(f"rti/{backend}" for backend in BACKENDS), *SQP, "ipopt"]
 REST = constant("x", 0.0)
 
 
@@ -58,36 +60,41 @@ def test_sqp_and_ipopt_agree_where_bounds_are_active(cost, alpha, alpha_dot, i, 
     np.testing.assert_allclose(one.u, other.u, atol=2e-3)
 
 
-def test_bound_of_the_input_is_reached_and_kept():
-    found = solve("sqp", motor_cart(), [0.3, 0.0, 0.0], **LIMITS)
+@pytest.mark.parametrize("kind", SQP)
+def test_bound_of_the_input_is_reached_and_kept(kind):
+    found = solve(kind, motor_cart(), [0.3, 0.0, 0.0], **LIMITS)
     assert found.u.max() == pytest.approx(24.0, abs=1e-12)
     assert found.u.min() >= -24.0
 
 
-def test_a_state_bound_that_can_be_kept_is_kept_exactly():
+@pytest.mark.parametrize("kind", SQP)
+def test_a_state_bound_that_can_be_kept_is_kept_exactly(kind):
     limits = {"inputs": {"v": Bounds(min=-24.0, max=24.0)}, "states": {"i": Bounds(min=-0.5, max=0.5)}}
-    found = solve("sqp", motor_cart(), [2.5, 0.0, 0.0], **limits)
+    found = solve(kind, motor_cart(), [2.5, 0.0, 0.0], **limits)
     assert np.abs(found.x[:, 2]).max() == pytest.approx(0.5 * (1 - 0.005), abs=1e-6)
     assert found.stats.slack == 0.0
 
 
-def test_a_state_bound_that_cannot_be_kept_yields_to_the_input_bound():
-    found = solve("sqp", motor_cart(), [np.pi / 2, 0.0, 6.0], **LIMITS)
+@pytest.mark.parametrize("kind", SQP)
+def test_a_state_bound_that_cannot_be_kept_yields_to_the_input_bound(kind):
+    found = solve(kind, motor_cart(), [np.pi / 2, 0.0, 6.0], **LIMITS)
     assert found.status == SolveStatus.SOLVED
     assert np.abs(found.u).max() <= 24.0
     assert found.stats.slack > 0.1
 
 
-def test_plan_obeys_the_model():
-    found = solve("sqp", motor_cart(), [1.0, 2.0, 1.0], **LIMITS)
+@pytest.mark.parametrize("kind", SQP)
+def test_plan_obeys_the_model(kind):
+    found = solve(kind, motor_cart(), [1.0, 2.0, 1.0], **LIMITS)
     system = motor_cart()
     following = evaluate(system.rk4(1), found.x[:-1], found.u, system.parameter_values, [0.01])
     np.testing.assert_allclose(found.x[1:], following, atol=1e-8)
 
 
-def test_real_time_iterations_converge_to_the_converged_solution():
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_real_time_iterations_converge_to_the_converged_solution(backend):
     x0 = np.array([0.8, 1.0, 0.0])
-    rti, references = problem(motor_cart(), "rti", **LIMITS)
+    rti, references = problem(motor_cart(), f"rti/{backend}", **LIMITS)
     made = references.over(0.0, x0, (0,))
     guess = Plan(made.x, made.u)
     for _ in range(8):
@@ -99,14 +106,16 @@ def test_real_time_iterations_converge_to_the_converged_solution():
     assert found.stats.kkt < 1e-8
 
 
-def test_a_start_without_plan_is_iterated_to_convergence_in_real_time_too():
-    found = solve("rti", motor_cart(), [0.8, 1.0, 0.0], **LIMITS)
+@pytest.mark.parametrize("kind", ["rti/compiled", "rti/casadi"])
+def test_a_start_without_plan_is_iterated_to_convergence_in_real_time_too(kind):
+    found = solve(kind, motor_cart(), [0.8, 1.0, 0.0], **LIMITS)
     assert found.stats.iterations > 1
     assert found.stats.kkt <= 1e-8
 
 
-def test_on_the_reference_nothing_is_to_be_done():
-    solver, references = problem(motor_cart(), "sqp")
+@pytest.mark.parametrize("kind", SQP)
+def test_on_the_reference_nothing_is_to_be_done(kind):
+    solver, references = problem(motor_cart(), kind)
     x0 = references.over(0.3, np.array([np.pi / 2, 0.0, 0.0]), (0,)).x[0]
     made = references.over(0.3, x0, (0,))
     found = solver.solve(x0, made)
@@ -124,15 +133,16 @@ def steep(start: float = 3.0) -> LagrangianSystem:
     )
 
 
-def test_line_search_reaches_what_ipopt_finds():
+@pytest.mark.parametrize("kind", SQP)
+def test_line_search_reaches_what_ipopt_finds(kind):
     options = {"reference": REST, "inputs": {"f": Bounds(min=-200.0, max=200.0)}, "iterations": 300}
-    one = solve("sqp", steep(), [0.9, -2.0], **options)
+    one = solve(kind, steep(), [0.9, -2.0], **options)
     other = solve("ipopt", steep(), [0.9, -2.0], **options)
     assert one.status == SolveStatus.SOLVED
     np.testing.assert_allclose(one.u, other.u, atol=1e-4)
 
 
-@pytest.mark.parametrize("kind", ["sqp", "ipopt"])
+@pytest.mark.parametrize("kind", [*SQP, "ipopt"])
 def test_iteration_limit_is_a_status_with_a_usable_plan(kind):
     found = solve(kind, motor_cart(), [0.3, 3.0, 0.0], iterations=2, **LIMITS)
     assert found.status == SolveStatus.LIMIT
@@ -165,15 +175,17 @@ def test_predictions_that_are_not_finite_fail_as_a_status(kind):
     assert found.stats.message
 
 
-def test_a_reference_beyond_the_models_edge_is_approached_from_standing_still():
+@pytest.mark.parametrize("kind", SQP)
+def test_a_reference_beyond_the_models_edge_is_approached_from_standing_still(kind):
     options = {"reference": constant("x", 2.0), "inputs": {"f": Bounds(min=-0.5, max=0.5)}}
-    found = solve("sqp", edge(), [0.0, 0.0], **options)
+    found = solve(kind, edge(), [0.0, 0.0], **options)
     assert found.status == SolveStatus.SOLVED
     np.testing.assert_allclose(found.u, 0.5)
 
 
-def test_a_plan_beyond_the_models_edge_is_given_up_for_the_reference():
-    solver, references = problem(edge(), "rti", reference=REST)
+@pytest.mark.parametrize("kind", ["rti/compiled", "rti/casadi"])
+def test_a_plan_beyond_the_models_edge_is_given_up_for_the_reference(kind):
+    solver, references = problem(edge(), kind, reference=REST)
     x0 = np.array([0.1, 0.0])
     made = references.over(0.0, x0, (0,))
     lost = Plan(np.full_like(made.x, 5.0), made.u)
@@ -182,8 +194,9 @@ def test_a_plan_beyond_the_models_edge_is_given_up_for_the_reference():
     np.testing.assert_allclose(found.u, solver.solve(x0, made).u)
 
 
-def test_a_step_beyond_the_models_edge_is_shortened():
-    found = solve("sqp", edge(), [0.9, 8.0], reference=REST, iterations=200)
+@pytest.mark.parametrize("kind", SQP)
+def test_a_step_beyond_the_models_edge_is_shortened(kind):
+    found = solve(kind, edge(), [0.9, 8.0], reference=REST, iterations=200)
     assert found.status in (SolveStatus.SOLVED, SolveStatus.LIMIT, SolveStatus.FAILED)
     assert np.isfinite(found.u).all()
 
@@ -196,7 +209,7 @@ class Never(QpSolver):
 
 
 def test_a_quadratic_program_without_solution_fails_as_a_status():
-    solver, references = problem(motor_cart(), "sqp")
+    solver, references = problem(motor_cart(), "sqp/casadi")
     assert isinstance(solver, GaussNewton)
     solver.qp = Never()
     x0 = np.array([1.0, 0.0, 0.0])
@@ -210,7 +223,7 @@ def test_a_plan_that_is_not_finite_fails_as_a_status():
         def solve(self, qp: StageQp) -> QpSolution:
             return QpSolution(np.full_like(qp.g, 1e300), qp.r, np.zeros((30, 0)), True, 0, "wild")
 
-    solver, references = problem(motor_cart(), "rti")
+    solver, references = problem(motor_cart(), "rti/casadi")
     assert isinstance(solver, GaussNewton)
     solver.qp = Wild()
     x0 = np.array([1.0, 0.0, 0.0])
@@ -241,15 +254,17 @@ def test_ipopt_that_raises_fails_as_a_status(monkeypatch):
     assert found.stats.message == "IPOPT: out of order"
 
 
-def test_substeps_refine_the_prediction():
-    coarse = solve("sqp", motor_cart(), [1.0, 2.0, 1.0])
-    fine = solve("sqp", motor_cart(), [1.0, 2.0, 1.0], substeps=4)
+@pytest.mark.parametrize("kind", SQP)
+def test_substeps_refine_the_prediction(kind):
+    coarse = solve(kind, motor_cart(), [1.0, 2.0, 1.0])
+    fine = solve(kind, motor_cart(), [1.0, 2.0, 1.0], substeps=4)
     difference = np.abs(coarse.u - fine.u).max()
     assert 0.0 < difference < 1e-2
 
 
-def test_guess_and_references_are_left_as_they_were():
-    solver, references = problem(motor_cart(), "sqp", reference=CART)
+@pytest.mark.parametrize("kind", SQP)
+def test_guess_and_references_are_left_as_they_were(kind):
+    solver, references = problem(motor_cart(), kind, reference=CART)
     x0 = np.array([1.0, 0.0, 0.0])
     made = references.over(0.0, x0, (0,))
     guess = Plan(made.x.copy(), made.u.copy())
