@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import fmpy
+import isolated
 import numpy as np
 import pyarrow as pa
 
@@ -249,13 +250,16 @@ def by_ecos(record: bool) -> Callable[[int], float]:
     ctypes.CDLL(str(library), ctypes.RTLD_GLOBAL)
     from ecospy import EcosLib, EcosSimulation, EcosSimulationStructure
 
+    variables = fmpy.read_model_description(str(FMU)).modelVariables
+    names = [f"plant::{v.name}" for v in variables if v.causality in ("input", "output")]
+
     def seconds(steps: int) -> float:
         with tempfile.TemporaryDirectory() as folder, EcosSimulationStructure() as structure:
             EcosLib.set_log_level("off")
             structure.add_model("plant", FMU)
             with EcosSimulation(structure=structure, step_size=STEP) as simulation:
                 if record:
-                    simulation.add_csv_writer(str(Path(folder) / "out.csv"))
+                    simulation.add_csv_writer(str(Path(folder) / "out.csv"), identifiers=names)
                 simulation.init()
                 began = time.process_time()
                 simulation.step(steps)
@@ -283,6 +287,11 @@ def fmus(quick: bool) -> Figures:
     steps = 20_000 if quick else 100_000
     both = [("a.alpha_dot", "b.v"), ("b.alpha_dot", "a.v")]
     return over_c("one_fmu", one_fmu, [], steps) | over_c("two_fmus", two_fmus, both, steps)
+
+
+def apart(quick: bool) -> Figures:
+    """An FMU in a process of its own, wall time; see `isolated.py`."""
+    return isolated.figures(1000 if quick else 5000)
 
 
 def circle(quick: bool) -> Figures:
@@ -317,13 +326,11 @@ def driven(quick: bool) -> Figures:
 
     def wave(steps: int) -> np.ndarray:
         t = STEP * np.arange(steps + 1)
-        return np.array(
-            list(zip(t, 12 * np.sin(2 * np.pi * t), strict=True)), dtype=[("time", float), ("v", float)]
-        )
+        rows = list(zip(t, 12 * np.sin(2 * np.pi * t), np.zeros(len(t)), strict=True))
+        return np.array(rows, dtype=[("time", float), ("v", float), ("tau_ext", float)])
 
-    mine, theirs = per_step(
-        [ours(make, [("drive.y", "plant.v")]), by_fmpy(wave)], 5_000 if quick else 50_000, 3
-    )
+    makers = [ours(make, [("drive.y", "plant.v")]), by_fmpy(wave)]
+    mine, theirs = per_step(makers, [20_000, 5_000] if quick else [100_000, 20_000])
     return {
         "driven.us_per_step": mine,
         "driven.fmpy_us_per_step": theirs,
@@ -353,6 +360,7 @@ FIGURES: dict[str, Callable[[bool], Figures]] = {
     "python": with_python,
     "others": others,
     "driven": driven,
+    "isolated": apart,
     "files": files,
     "ring": circle,
 }

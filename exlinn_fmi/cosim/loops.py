@@ -20,7 +20,8 @@ from exlinn_fmi.components.base import Indices, Values
 from exlinn_fmi.errors import ComponentError, LoopError
 
 if TYPE_CHECKING:
-    from exlinn_fmi.cosim.plan import Exchange, Plan
+    from exlinn_fmi.cosim.exchange import Exchange
+    from exlinn_fmi.cosim.plan import Plan
 
 SOLVERS = ("newton", "anderson", "aitken", "fixed-point")
 DEPTH = 5

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from exlinn_fmi.components.base import Values
 from exlinn_fmi.components.native import Native, NativeAccess
 from exlinn_fmi.cosim import kernel as k
-from exlinn_fmi.cosim.plan import Advance, Exchange, Plan
+from exlinn_fmi.cosim.exchange import Advance, Exchange
+from exlinn_fmi.cosim.plan import Plan
 
 Columns = dict[int, int]
 

@@ -1,4 +1,4 @@
-"""The same systems through our master and through other people's: the same trajectories where they are right."""
+"""The same systems through our master and other people's: the same trajectories where they are right."""
 
 from __future__ import annotations
 
