@@ -25,8 +25,8 @@ Rows = NDArray[np.float64]
 BLOCK = 2**24
 """Bytes of rows that are in memory at a time."""
 
-FULL_FRAME = 2**29
-"""Bytes of rows from which on a run is kept on disk, and only every n-th row of it is put into a frame."""
+FULL_FRAME, THINNED_FRAME = 2**29, 2**26
+"""Bytes of rows beyond which a run is kept on disk, and of the n-th rows that are put into a frame then."""
 
 
 class RowFile:
@@ -90,8 +90,9 @@ class RowFile:
                 yield np.frombuffer(data).reshape(-1, self.columns)
 
     def thinned(self) -> Rows:
-        """Every n-th row, so that they fit well into memory; all of them if they do."""
-        every = -(-8 * self.columns * self.rows // FULL_FRAME) or 1
+        """Every n-th row, so that they take little memory; all of them if they fit well."""
+        size = 8 * self.columns * self.rows
+        every = 1 if size <= FULL_FRAME else -(-size // THINNED_FRAME)
         parts, first = [np.empty((0, self.columns))], 0
         for block in self.blocks():
             parts.append(block[-first % every :: every])

@@ -146,7 +146,8 @@ def test_streamed_rows_are_those_in_memory(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize("every", [1, 3])
 def test_a_frame_of_many_rows_is_thinned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int):
     expected = make(record_every=every).run().frame
-    monkeypatch.setattr(store_module, "FULL_FRAME", 8 * 8 * 50)
+    monkeypatch.setattr(store_module, "FULL_FRAME", 8 * 8 * 60)
+    monkeypatch.setattr(store_module, "THINNED_FRAME", 8 * 8 * 50)
     monkeypatch.setattr(store_module.RowFile, "block", 16)
     result = make(record_every=every).run(store=Store(tmp_path))
     n = -(-len(expected) // 50)
