@@ -23,6 +23,7 @@ from typing import Any
 
 import fmpy
 import isolated
+import model_exchange
 import numpy as np
 import pyarrow as pa
 
@@ -294,6 +295,11 @@ def apart(quick: bool) -> Figures:
     return isolated.figures(1000 if quick else 5000)
 
 
+def exchanged(quick: bool) -> Figures:
+    """Trajectories of a Model Exchange FMU per second, ours over FMPy's; see `model_exchange.py`."""
+    return model_exchange.figures()
+
+
 def circle(quick: bool) -> Figures:
     """Many FMUs in a ring."""
     size = 50 if quick else 1000
@@ -361,6 +367,7 @@ FIGURES: dict[str, Callable[[bool], Figures]] = {
     "others": others,
     "driven": driven,
     "isolated": apart,
+    "me": exchanged,
     "files": files,
     "ring": circle,
 }

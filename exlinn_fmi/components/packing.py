@@ -6,7 +6,9 @@ JSON, with arrays, bytes and tuples marked as such. Nothing is run when it is re
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ _KIND = "exlinn:kind"
 
 
 def pack(value: object) -> bytes:
-    """Bytes of a value made of None, booleans, numbers, texts, bytes, arrays, lists, tuples and dictionaries.
+    """Bytes of a value made of None, booleans, numbers, texts, bytes, arrays, containers and dataclasses.
 
     Raises:
         NotImplementedError: there is something else in it.
@@ -23,9 +25,15 @@ def pack(value: object) -> bytes:
     return json.dumps(_mark(value)).encode()
 
 
-def unpack(data: bytes) -> Any:
-    """The value that `pack` was given."""
-    return json.loads(data, object_hook=_restore)
+def unpack(data: bytes, records: Iterable[type] = ()) -> Any:
+    """The value that `pack` was given.
+
+    Args:
+        data: what `pack` gave.
+        records: the dataclasses that may be in it.
+    """
+    known = {record.__name__: record for record in records}
+    return json.loads(data, object_hook=lambda mapping: _restore(mapping, known))
 
 
 def _mark(value: object) -> Any:
@@ -45,16 +53,21 @@ def _mark(value: object) -> Any:
         return {_KIND: "array", "dtype": value.dtype.str, "shape": list(value.shape), "data": data}
     if isinstance(value, dict) and all(isinstance(k, str) for k in value) and _KIND not in value:
         return {k: _mark(v) for k, v in value.items()}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: _mark(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {_KIND: "record", "name": type(value).__name__, "fields": fields}
     raise NotImplementedError(f"its state holds a {type(value).__name__}, which cannot be written as bytes")
 
 
-def _restore(mapping: dict[str, Any]) -> Any:
+def _restore(mapping: dict[str, Any], records: Mapping[str, type]) -> Any:
     """What a marked mapping stands for."""
     match mapping.get(_KIND):
         case "tuple":
             return tuple(mapping["items"])
         case "bytes":
             return base64.b64decode(mapping["data"])
+        case "record":
+            return records[mapping["name"]](**mapping["fields"])
         case "scalar":
             return mapping["array"][()]
         case "array":

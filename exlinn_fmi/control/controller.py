@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values
+from exlinn_fmi.components.packing import pack, unpack
 from exlinn_fmi.control.defaults import completed, estimator, measure, refined
 from exlinn_fmi.control.diagnosis import diagnose
-from exlinn_fmi.control.estimator import Belief
+from exlinn_fmi.control.estimator import Belief, Sample
 from exlinn_fmi.control.ocp import HORIZON, Ocp, check_names
 from exlinn_fmi.control.reference import ReferenceGenerator, References
 from exlinn_fmi.control.solver import Plan, Solution, SolveStatus, make_solver
@@ -208,6 +209,19 @@ class NmpcController(Component):
         assert isinstance(state, tuple)
         self._memory, self._following, measured, outputs, self.message = state
         self._measured, self._outputs = measured.copy(), outputs.copy()
+
+    @property
+    def can_serialize_state(self) -> bool:
+        """Always."""
+        return True
+
+    def serialize_state(self, state: object) -> bytes:
+        """A state as bytes."""
+        return pack(state)
+
+    def deserialize_state(self, data: bytes) -> object:
+        """A state from bytes."""
+        return unpack(data, (_Memory, Plan, References, Belief, Sample))
 
     def close(self) -> None:
         """Nothing to free."""

@@ -13,6 +13,12 @@ import pandas as pd
 import pytest
 
 from exlinn_fmi.cli import exit_code
+from exlinn_fmi.errors import Interrupted
+from exlinn_fmi.interrupts import StopRequest
+from exlinn_fmi.pipeline import simulate
+from exlinn_fmi.workspace import Run
+
+ROOT = Path(__file__).parents[2]
 
 SCENARIO = """
 name: long
@@ -135,3 +141,55 @@ def test_algorithms_are_set_in_the_scenario(tmp_path: Path):
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["simulate.communication_steps"] >= 50
     assert len(pd.read_csv(tmp_path / "out" / "trajectories.csv")) == 26
+
+
+CLOSED_LOOP = """
+name: loop
+components:
+  plant: {fmu: DCMotorCart.fmu, start: {alpha: 1.5707963}}
+  ctl:
+    step: 0.01
+    nmpc:
+      model: plant:dc_motor_cart
+      horizon: 12
+      inputs: {v: {min: -24, max: 24}}
+      weights: {states: {alpha: 1.0e+4, i: 1.0e-2}, inputs: 1.0e-4}
+      safe_input: {v: 0}
+      reference:
+        coordinate: alpha
+        trajectory: {signal: sine, amplitude: 0.1, frequency: 1, offset: 1.5, unit: rad}
+connections: {plant.alpha: ctl.alpha, plant.alpha_dot: ctl.alpha_dot, plant.i: ctl.i, ctl.v: plant.v}
+simulate: {stop: 0.4, step: 1.0e-3, checkpoint: 1000}
+"""
+
+
+class Impatient(StopRequest):
+    """A user who stops the run at one of the communication points."""
+
+    def __init__(self, left: int) -> None:
+        super().__init__()
+        self.left = left
+
+    def __call__(self) -> bool:
+        self.left -= 1
+        return self.left < 0
+
+
+def test_a_controller_goes_on_with_what_it_had_in_mind(tmp_path: Path):
+    (tmp_path / "DCMotorCart.fmu").write_bytes((ROOT / "fmus" / "DCMotorCart.fmu").read_bytes())
+    file = tmp_path / "loop.yaml"
+    file.write_text(CLOSED_LOOP)
+    frames = {}
+    for name in ("whole", "parted"):
+        work = Run.open(file, tmp_path / name)
+        if name == "parted":
+            work.stop = Impatient(173)
+            with pytest.raises(Interrupted, match="--resume goes on from there"):
+                simulate(work)
+            work = Run.open(file, tmp_path / name)
+        simulate(work, resume=name == "parted")
+        frames[name] = pd.read_parquet(tmp_path / name / "trajectories.parquet")
+    timed = [c for c in frames["whole"] if "solve_time" in c]
+    whole, parted = (frame.drop(columns=timed) for frame in frames.values())
+    assert whole["ctl.fallbacks"].max() == 0
+    assert parted.to_numpy().tobytes() == whole.to_numpy().tobytes()
