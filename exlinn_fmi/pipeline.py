@@ -165,7 +165,9 @@ def simulate(work: Run, resume: bool = False) -> None:
     if any(uses_learned(spec) for spec in scenario.components.values()):
         train(work)
     model = [path for path in work.folder.glob("model.*") if uses_learned(scenario)]
-    key = fingerprint(scenario, files=[*work.files(scenario), *sorted(model)])
+    # What `exlinn design` is to look for has no bearing on this.
+    settings = scenario.model_dump(mode="json", exclude={"learn": {"design"}})
+    key = fingerprint(settings, files=[*work.files(scenario), *sorted(model)])
     detail = f"{span.stop - span.start:g} s in steps of {span.step:g} s"
     if work.unchanged("simulate", key, detail):
         return

@@ -14,13 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from exlinn_fmi.data.files import read_json, write_json
-
-
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file's content."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+from exlinn_fmi.data.files import file_hash, read_record, write_json
 
 
 @cache
@@ -49,7 +43,7 @@ class Stages:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._file = folder / "stages.json"
-        self._entries: dict[str, dict[str, Any]] = read_json(self._file) if self._file.exists() else {}
+        self._entries: dict[str, dict[str, Any]] = read_record(self._file)
 
     def key(self, stage: str) -> str | None:
         """Key under which a stage was done last, None if it was not."""

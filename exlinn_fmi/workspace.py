@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from exlinn_fmi.components.base import Component
-from exlinn_fmi.data.files import read_json, write_json, write_text
+from exlinn_fmi.data.files import read_record, write_json, write_text
 from exlinn_fmi.errors import ExlinnError, InputError
 from exlinn_fmi.factory import build, inspect
 from exlinn_fmi.interrupts import StopRequest
@@ -171,6 +171,4 @@ class Run:
 
 def metrics(folder: Path) -> dict[str, Any]:
     """The metrics of a run folder by name, {} where there are none yet."""
-    file = folder / "metrics.json"
-    found: dict[str, Any] = read_json(file) if file.exists() else {}
-    return found
+    return read_record(folder / "metrics.json")

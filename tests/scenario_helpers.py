@@ -10,7 +10,24 @@ from exlinn_fmi.errors import FmuError, Problem, ScenarioError
 from exlinn_fmi.scenario.load import LoadedScenario, load_scenario
 from exlinn_fmi.scenario.schema import FmuComponent, PythonComponentSpec
 
-SCENARIO = """\
+MOTOR_COORDINATES = """\
+    - name: alpha
+      unit: rad
+      topology: circle
+      position: plant.alpha
+      velocity: plant.alpha_dot
+      acceleration: plant.alpha_ddot
+    - name: Q
+      unit: C
+      kind: electrical
+      topology: cyclic
+      velocity: plant.i
+      velocity_unit: A
+"""
+"""The motor's coordinates, but for the rest of the charge's keys."""
+
+SCENARIO = (
+    """\
 name: valid
 description: every section, nothing wrong   # line 2
 seed: 3
@@ -45,18 +62,9 @@ connections:
 learn:
   plant: plant
   coordinates:
-    - name: alpha
-      unit: rad
-      topology: circle
-      position: plant.alpha
-      velocity: plant.alpha_dot
-      acceleration: plant.alpha_ddot
-    - name: Q
-      unit: C
-      kind: electrical
-      topology: cyclic
-      velocity: plant.i
-      velocity_unit: A
+"""
+    + MOTOR_COORDINATES
+    + """\
       input: plant.v
       input_unit: V
   training:
@@ -87,6 +95,7 @@ metrics:
   settle: 2
   output: plant.x
 """
+)
 
 MOTOR = (
     Variable("tau_ext", "input", unit="N.m", start=0.0),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import errno
+import hashlib
 import io
 import json
 import math
@@ -17,6 +18,7 @@ import os
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,6 +107,40 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read ({_one_line(error)}); make it again or remove it") from error
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """Read a JSON object that a run wrote, empty where there is none.
+
+    Raises:
+        DataError: it is no JSON object.
+    """
+    if not path.is_file():
+        return {}
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: found {type(content).__name__} where a JSON object is expected; remove it")
+    return content
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file's content in hexadecimal; computed anew only where the file has changed since.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    try:
+        at = path.stat()
+        return _hash_of(path, (at.st_mtime_ns, at.st_size, at.st_ino))
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+@lru_cache(maxsize=1024)
+def _hash_of(path: Path, stamp: tuple[int, int, int]) -> str:
+    """The hash of a file as it was when it had this stamp."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def write_table(stem: Path, frame: pd.DataFrame, units: Mapping[str, str]) -> list[Path]:

@@ -153,7 +153,7 @@ class Problem:
         value = self.system.parameter_values
         scaled = information * np.outer(value, value)
         size = np.sqrt(np.maximum(np.diag(scaled), np.finfo(float).tiny))
-        values, vectors = np.linalg.eigh(scaled / np.outer(size, size))
+        values, vectors = np.linalg.eigh(scaled / size[:, None] / size)
         seen = values > UNSEEN * max(values.max(), np.finfo(float).tiny)
         variance = ((vectors[:, seen] / size[:, None]) ** 2 / values[seen]).sum(axis=1)
         lost = (np.abs(vectors[:, ~seen]) > 1e-4).any(axis=1) | (np.diag(scaled) <= 0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 import re
 import sys
@@ -15,7 +14,7 @@ from typing import Any
 
 import pandas as pd
 
-from exlinn_fmi.data.files import read_json, read_table, write_json
+from exlinn_fmi.data.files import file_hash, read_record, read_table, write_json
 from exlinn_fmi.errors import DataError, Problem, ScenarioError
 from exlinn_fmi.scenario.document import parse
 from exlinn_fmi.scenario.explain import schema_findings
@@ -98,8 +97,8 @@ def read_run(folder: Path) -> RunFiles:
         curves=_csv(folder / "curves.csv"),
         trajectories=_table(folder / "trajectories"),
         study=_csv(folder / "study.csv"),
-        metrics=_json(folder / "metrics.json"),
-        provenance=_json(folder / "provenance.json"),
+        metrics=read_record(folder / "metrics.json"),
+        provenance=read_record(folder / "provenance.json"),
     )
 
 
@@ -145,24 +144,11 @@ def write_provenance(folder: Path, record: Mapping[str, Any]) -> None:
     write_json(folder / "provenance.json", record)
 
 
-def sha256(file: Path) -> str:
-    """SHA-256 of a file's content in hexadecimal.
-
-    Raises:
-        DataError: it cannot be read.
-    """
-    try:
-        with file.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise DataError(f"{file}: cannot be read ({error.strerror or error})") from error
-
-
 def _hashes(files: Sequence[Path]) -> dict[str, str]:
     """Hash by name, or by path where two files have the same name."""
     files = list(dict.fromkeys(files))
     names = [file.name for file in files]
-    return {file.name if names.count(file.name) == 1 else file.as_posix(): sha256(file) for file in files}
+    return {file.name if names.count(file.name) == 1 else file.as_posix(): file_hash(file) for file in files}
 
 
 def _scenario(file: Path, text: str) -> Scenario:
@@ -210,13 +196,3 @@ def _csv(file: Path) -> pd.DataFrame | None:
     except (OSError, ValueError) as error:
         raise DataError(f"{file}: cannot be read as CSV ({error}); make it again or remove it") from error
     return frame if len(frame) else None
-
-
-def _json(file: Path) -> dict[str, Any]:
-    """A JSON object, empty where there is none."""
-    if not file.is_file():
-        return {}
-    content = read_json(file)
-    if not isinstance(content, dict):
-        raise DataError(f"{file}: found {type(content).__name__} where a JSON object is expected; remove it")
-    return content

@@ -7,32 +7,25 @@ from pathlib import Path
 
 import pytest
 from ruamel.yaml import YAML
+from scenario_helpers import MOTOR_COORDINATES
 
 from exlinn_fmi.cli import exit_code
 from exlinn_fmi.interrupts import StopRequest
-from exlinn_fmi.pipeline import design
+from exlinn_fmi.pipeline import design, simulate
 from exlinn_fmi.scenario.load import load_scenario
 from exlinn_fmi.workspace import Run
 
-SCENARIO = """\
+SCENARIO = (
+    """\
 name: designed
 components:
   plant: {plant: dc_motor_cart, start: {r: 4.0}}
 learn:
   plant: plant
   coordinates:
-    - name: alpha
-      unit: rad
-      topology: circle
-      position: plant.alpha
-      velocity: plant.alpha_dot
-      acceleration: plant.alpha_ddot
-    - name: Q
-      unit: C
-      kind: electrical
-      topology: cyclic
-      velocity: plant.i
-      velocity_unit: A
+"""
+    + MOTOR_COORDINATES
+    + """\
       acceleration: plant.i_dot
       input: plant.v
       input_unit: V
@@ -50,6 +43,7 @@ learn:
     limits: {inputs: {v: {min: -12, max: 12}}, states: {i: {min: -4, max: 4}}}
     candidates: 30
 """
+)
 
 
 @pytest.fixture
@@ -163,3 +157,14 @@ def test_measured_data_cannot_be_excited(tmp_path: Path, capsys: pytest.CaptureF
     measured = Path(__file__).parents[2] / "scenarios" / "measured.yaml"
     assert exit_code(["design", str(measured), "--out", str(tmp_path)]) == 1
     assert "nothing to excite" in capsys.readouterr().err
+
+
+def test_what_is_to_be_designed_does_not_bring_the_simulation_back(tmp_path: Path) -> None:
+    text = SCENARIO + "connections: {}\nsimulate: {stop: 0.1, step: 0.01}\n"
+    (tmp_path / "designed.yaml").write_text(text)
+    runs = []
+    for candidates in (30, 40):
+        override = f"learn.design.candidates={candidates}"
+        runs.append(Run.open(tmp_path / "designed.yaml", tmp_path / "run", [override]))
+        simulate(runs[-1])
+    assert [run.history["simulate"]["status"] for run in runs] == ["ran", "cached"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 from pathlib import Path
@@ -15,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exlinn_fmi.data import files
+from exlinn_fmi.data.files import file_hash, read_record
 from exlinn_fmi.errors import DataError, StorageError
 
 AWKWARD = [0.0, -0.0, 0.1, 1 / 3, 1e22, 123456789012345678.0, 5e-324, 1.7976931348623157e308, -1e-7]
@@ -261,3 +263,26 @@ def test_json_that_is_missing_or_broken_is_a_data_error(tmp_path: Path) -> None:
     for name in ("broken.json", "missing.json"):
         with pytest.raises(DataError, match=name):
             files.read_json(tmp_path / name)
+
+
+def test_a_hash_follows_the_content_and_an_unchanged_file_is_read_once(tmp_path, monkeypatch):
+    file = tmp_path / "a"
+    file.write_bytes(b"one")
+    first = file_hash(file)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", lambda *_: pytest.fail("read again"))
+        assert file_hash(file) == first
+    file.write_bytes(b"other")
+    assert file_hash(file) == hashlib.sha256(b"other").hexdigest() != first
+    with pytest.raises(DataError, match="gone: cannot be read"):
+        file_hash(tmp_path / "gone")
+
+
+def test_a_record_is_a_json_object_or_empty(tmp_path):
+    file = tmp_path / "metrics.json"
+    assert read_record(file) == {}
+    file.write_text('{"a": 1}')
+    assert read_record(file) == {"a": 1}
+    file.write_text("[1]")
+    with pytest.raises(DataError, match="found list where a JSON object is expected"):
+        read_record(file)
