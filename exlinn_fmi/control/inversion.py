@@ -6,6 +6,10 @@ their derivatives they are equations for the other coordinates: for their veloci
 of these equations as unknowns z, and they contain no derivative of z, what is referenced is a flat output: z
 follows by Newton's method, ż and z̈ by implicit differentiation, exactly, and the rows with input give u.
 
+**Nearly flat.** A learned model may hold derivatives of z that are no more than its error. They are taken
+from the equations without them, which is right to the second order of what they do; where they do more than
+`NEARLY` the system is not taken for flat.
+
 **Steady.** Any other system is given a rest for each value of the reference: accelerations 0, velocities of
 the other coordinates 0 save those of cyclic ones; what remains unknown, with the input, is fitted by least
 squares, near the starting point where it is not determined.
@@ -26,6 +30,14 @@ from jaxtyping import Bool, Float
 from exlinn_fmi.control.batch import Batch
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, Symbol
 
+DERIVATIVES = "the equations without input contain derivatives of the other coordinates"
+
+STARTS = tuple(10.0**-k for k in range(10))
+"""Where unknowns are looked for from, one after the other, if not from the guess."""
+
+NEARLY = 1e-3
+"""Most that derivatives of the unknowns may change these, over their size, in a system taken for flat."""
+
 ORDERS = 4
 """Highest derivative of the referenced position that an inversion may use."""
 
@@ -41,6 +53,7 @@ class Inversion:
             coordinate c, one after the other, and f the constant force on each coordinate.
         completion: (y, z, f) → (x, u).
         unknowns: how z reads off a state x and input u: indices into (x, u).
+        static: the equations without the derivatives of z, None where they contain none.
     """
 
     flat: bool
@@ -48,6 +61,7 @@ class Inversion:
     equations: ca.Function
     completion: ca.Function
     unknowns: tuple[int, ...]
+    static: ca.Function | None = None
 
 
 def invert(system: LagrangianSystem, coordinates: Sequence[int], velocities: Sequence[bool]) -> Inversion:
@@ -59,7 +73,7 @@ def invert(system: LagrangianSystem, coordinates: Sequence[int], velocities: Seq
         velocities: whether the velocity of each is referenced rather than its position.
     """
     found = _flat(system, coordinates)
-    return found if isinstance(found, Inversion) else _steady(system, coordinates, velocities, found)
+    return found if isinstance(found, Inversion) else steady(system, coordinates, velocities, found)
 
 
 def _flat(system: LagrangianSystem, referenced: Sequence[int]) -> Inversion | str:
@@ -86,22 +100,23 @@ def _flat(system: LagrangianSystem, referenced: Sequence[int]) -> Inversion | st
             motion[k][i] = z[k - level][j] if k >= level else 0
     force = _forces(system, motion[0], motion[1], motion[2], f)
     equations = force[free]
-    if others and ca.depends_on(equations, ca.vertcat(z[1], z[2])):
-        return "the equations without input contain derivatives of the other coordinates"
-    jacobian = ca.jacobian(equations, z[0])
+    moving = ca.vertcat(z[1], z[2])
+    nearly = bool(others) and ca.depends_on(equations, moving)
+    static = ca.substitute(equations, moving, ca.SX.zeros(moving.shape)) if nearly else equations
+    jacobian = ca.jacobian(static, z[0])
     if ca.sprank(jacobian) < len(others):
-        return "the equations without input do not contain the other coordinates"
+        return DERIVATIVES if nearly else "the equations without input do not contain the other coordinates"
 
     x, u = _state(system, motion[0], motion[1]), force[driven]
     if others:
         # d/dt r(y, z) = 0 and d²/dt² r(y, z) = 0 are linear in ż and z̈, with the same matrix ∂r/∂z.
         rate = ca.vertcat(*(ca.vertcat(part[1:], 0) for part in ca.vertsplit(y, orders)))
-        drift = ca.jtimes(equations, y, rate)
+        drift = ca.jtimes(static, y, rate)
         slope = drift + jacobian @ z[1]
         curvature = ca.jtimes(slope, y, rate) + ca.jtimes(slope, z[0], z[1])
         z1, z2 = -ca.solve(jacobian, drift), -ca.solve(jacobian, curvature)
-        x, u = ca.substitute([x, u], [z[2]], [z2])
-        x, u = ca.substitute([x, u], [z[1]], [z1])
+        x, u, equations = ca.substitute([x, u, equations], [z[2]], [z2])
+        x, u, equations = ca.substitute([x, u, equations], [z[1]], [z1])
     kept = system.state_names
     names = [system.coordinates[i].velocity if level else system.coordinates[i].name for i in others]
     return Inversion(
@@ -110,13 +125,21 @@ def _flat(system: LagrangianSystem, referenced: Sequence[int]) -> Inversion | st
         ca.Function("equations", [y, z[0], f], [ca.densify(equations), ca.densify(jacobian)]),
         _completion(y, z[0], f, x, u),
         tuple(kept.index(name) for name in names),
+        ca.Function("static", [y, z[0], f], [ca.densify(static), ca.densify(jacobian)]) if nearly else None,
     )
 
 
-def _steady(
+def steady(
     system: LagrangianSystem, referenced: Sequence[int], velocities: Sequence[bool], reason: str
 ) -> Inversion:
-    """The inversion that gives a rest for each value of the reference."""
+    """The inversion that gives a rest for each value of the reference.
+
+    Args:
+        system: the model.
+        referenced: indices of the coordinates that follow a reference.
+        velocities: whether the velocity of each is referenced rather than its position.
+        reason: why the system is not taken for flat.
+    """
     n, kept, m = system.n, system.state_names, len(system.input_names)
     y, f = ca.SX.sym("y", (ORDERS + 1) * len(referenced)), ca.SX.sym("f", n)
     q, v = ca.SX.zeros(n), ca.SX.zeros(n)
@@ -190,20 +213,35 @@ class Inverter:
         Returns:
             z, x and u; where there is no solution z is the guess, and nothing is ever infinite or NaN.
         """
-        z, solved = self._solve(y, guess, force)
-        if not solved.all():
-            # A guess at rest can be a singular point (force ∝ i² at i = 0): try from a generic one.
-            again, more = self._solve(y, np.ones_like(guess), force)
-            z = np.where((more & ~solved)[:, None], again, np.where(solved[:, None], z, guess))
+        z, _ = self.find(y, guess, force)
         x, u = (
             np.nan_to_num(r[:, :, 0], nan=0.0, posinf=0.0, neginf=0.0) for r in self._completion(y, z, force)
         )
         return z, x, u
 
-    def _solve(
+    def find(
         self, y: Float[np.ndarray, "k o"], guess: Float[np.ndarray, "k z"], force: Float[np.ndarray, " c"]
     ) -> tuple[Float[np.ndarray, "k z"], Bool[np.ndarray, " k"]]:
-        """Gauss–Newton with steps of least norm, and where it ended in a solution."""
+        """As `solve`, and where that finds none from other points; where there is no solution, the guess."""
+        z, solved = self.solve(y, guess, force)
+        for size in STARTS:
+            if solved.all():
+                break
+            # A guess at rest can be a singular point (force ∝ i² at i = 0), and nanocoulombs are far from 1.
+            again, more = self.solve(y, np.full_like(guess, size), force)
+            z, solved = np.where((more & ~solved)[:, None], again, z), solved | more
+        return np.where(solved[:, None], z, guess), solved
+
+    def solve(
+        self, y: Float[np.ndarray, "k o"], guess: Float[np.ndarray, "k z"], force: Float[np.ndarray, " c"]
+    ) -> tuple[Float[np.ndarray, "k z"], Bool[np.ndarray, " k"]]:
+        """Unknowns by Gauss–Newton with steps of least norm, and where they are a solution.
+
+        Args:
+            y: referenced positions and their derivatives, shape (count, references · (ORDERS + 1)).
+            guess: start of the iteration, shape (count, unknowns).
+            force: constant force on each coordinate.
+        """
         z = guess.copy()
         converged = np.full(len(z), z.shape[1] == 0)
         for _ in range(self.ITERATIONS):

@@ -9,14 +9,15 @@ inputs, which are held, in the middle of each interval.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from exlinn_fmi.control.inversion import ORDERS, Inverter, invert
+from exlinn_fmi.control.inversion import DERIVATIVES, NEARLY, ORDERS, Inverter, invert, steady
 from exlinn_fmi.control.trajectory import REACH, branch_of, coordinate_of, derivatives, integral
 from exlinn_fmi.data.excitation import signal_function
 from exlinn_fmi.errors import ModelError, nearest
@@ -166,14 +167,28 @@ class ReferenceGenerator:
             raise ModelError("reference: two references are for the same coordinate; keep one")
         self.states = [t.state for t in self.trajectories]
         """Indices of the referenced states."""
-        self.inversion = invert(system, referenced, [t.velocity for t in self.trajectories])
-        """How reference states and inputs are found; `inversion.flat` and `.reason` say what was decided."""
         self._grid = 2 * horizon + 1
+        velocities = [t.velocity for t in self.trajectories]
+        self.inversion = invert(system, referenced, velocities)
+        """How reference states and inputs are found; `inversion.flat` and `.reason` say what was decided."""
+        if self.inversion.static is not None and not self._nearly_flat(system, self.inversion.static):
+            self.inversion = steady(system, referenced, velocities, DERIVATIVES)
         self._all = Inverter(self.inversion, self._grid)
         self._next = Inverter(self.inversion, 2)
         self._inputs = len(system.input_names)
         self.still = np.zeros(system.n)
         """No force."""
+
+    def _nearly_flat(self, system: LagrangianSystem, static: ca.Function) -> bool:
+        """Whether derivatives of the unknowns hardly change these along the beginning of the reference."""
+        rest, count = np.zeros(len(system.state_names)), self._grid
+        y, none = self._motion(0.0, 0, count, rest, self.branch(rest)), np.zeros(system.n)
+        start = np.zeros((count, len(self.inversion.unknowns)))
+        z, solved = Inverter(replace(self.inversion, equations=static), count).find(y, start, none)
+        if not solved.all():
+            return False
+        moved, again = Inverter(self.inversion, count).solve(y, z, none)
+        return bool(again.all() and np.abs(moved - z).max() <= NEARLY * np.abs(z).max())
 
     def check(self, start: float, stop: float) -> None:
         """Refuse a run that a table, told to be an error outside its rows, does not cover.

@@ -245,3 +245,35 @@ def test_the_reference_input_holds_against_a_constant_force():
     np.testing.assert_allclose(held.grid_u[:, 0], free.grid_u[:, 0] - 5.0 * 0.3 + 0.5, atol=1e-8)
     moved = made.over(STEP, START, (0,), free, force)
     np.testing.assert_allclose(moved.grid_u, made.over(STEP, START, (0,), None, force).grid_u, atol=1e-7)
+
+
+def almost_constant_inductance(share: float) -> LagrangianSystem:
+    """A plate actuator whose inductance depends on the plate's position: no flat output, strictly."""
+    return LagrangianSystem.build(
+        (
+            Coordinate("x", "m"),
+            Coordinate("Q", "C", "electrical", "line", velocity="i", velocity_unit="A", input="u"),
+        ),
+        lambda q, v, p: (
+            0.5 * v[0] ** 2
+            + 0.5 * (1 + share * q[0]) * v[1] ** 2
+            - 0.5 * q[0] ** 2
+            - 0.5 * q[1] ** 2 * (2.0 - q[0])
+        ),
+        lambda v, p: 0.5 * v[0] ** 2 + 0.5 * v[1] ** 2,
+    )
+
+
+def test_a_system_that_is_flat_but_for_its_error_is_taken_for_flat():
+    system = almost_constant_inductance(1e-3)
+    made = generator(system, sine("x", 0.02, 0.5))
+    assert made.inversion.flat
+    assert_follows_model(system, made.over(0.2, np.array([0.5, 0.5, 0.0, 0.0]), (0,)))
+    exact = generator(plate_actuator(), sine("x", 0.02, 0.5)).over(0.2, np.array([0.5, 0.5, 0.0, 0.0]), (0,))
+    near = made.over(0.2, np.array([0.5, 0.5, 0.0, 0.0]), (0,))
+    assert 0.0 < np.abs(near.grid_u - exact.grid_u).max() < 1e-3
+
+
+def test_a_system_that_is_far_from_flat_is_not():
+    made = generator(almost_constant_inductance(100.0), sine("x", 0.2, 0.5, frequency=2.0))
+    assert not made.inversion.flat
