@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from pandas import DataFrame
 
-from exlinn_fmi.pipeline import Run, collect
+from exlinn_fmi.data.files import read_table
+from exlinn_fmi.pipeline import Run, collect, simulate
 from exlinn_fmi.plants import plant
+from exlinn_fmi.workspace import metrics
 
 SCENARIOS = ("maglev", "mems", "motor_pendulum", "two_link_arm")
 
@@ -52,3 +54,25 @@ def test_both_joints_of_the_arm_go_all_the_way_round(frames: dict[str, DataFrame
     assert share_of_circle(frames["two_link_arm"]["phi_1"]) == 1
     assert share_of_circle(frames["two_link_arm"]["phi_2"]) == 1
     assert (share_of_circle(frames["two_link_arm"]["phi_1"] + frames["two_link_arm"]["phi_2"])) == 1
+
+
+TRACKED = {
+    # name: (error after settling at most, time simulated, bounded variable, bound that is reached)
+    "maglev": ({"rmse_x_m": 1e-7}, 1.4, "plant.i", 0.75),
+    "mems": ({"rmse_x_m": 1e-8}, 1.4, "plant.v", 2000.0),
+    "motor_pendulum": ({"rmse_phi_rad": 1e-3}, 2.6, "plant.i", 1.0),
+    "two_link_arm": ({"rmse_phi_1_rad": 1e-3, "rmse_phi_2_rad": 1e-3}, 2.6, "plant.i_1", 8.0),
+}
+
+
+@pytest.mark.parametrize("name", TRACKED)
+def test_a_model_learned_of_the_plant_tracks_within_bounds(name: str, root: Path, tmp_path: Path) -> None:
+    errors, stop, bounded, bound = TRACKED[name]
+    settings = [f"simulate.stop={stop}", "learn.identify={}", "learn.method.iterations=100"]
+    simulate(Run.open(root / "scenarios" / f"{name}.yaml", tmp_path, settings))
+    found = metrics(tmp_path)
+    for metric, most in errors.items():
+        assert found[f"control.{metric}"] <= most
+    assert found["control.fallbacks"] == 0
+    reached = read_table(tmp_path / "trajectories")[0][bounded].abs().max()
+    assert 0.97 * bound <= reached <= 1.05 * bound
