@@ -6,7 +6,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from exlinn_fmi.components.base import Variable
+from exlinn_fmi.components.base import TEXT_TYPES, Variable
+from exlinn_fmi.components.texts import shown
 from exlinn_fmi.data.files import read_json
 from exlinn_fmi.errors import InputError
 
@@ -29,10 +30,29 @@ def describe(target: Path, overrides: Sequence[str] = ()) -> str:
     if not target.exists():
         raise InputError(f"{target}: no such file or folder; give a scenario, an FMU or a run folder")
     if target.suffix == ".fmu":
-        from exlinn_fmi.components.fmu import read_variables
-
-        return f"{target}\n" + describe_variables(read_variables(target))
+        return f"{target}\n" + describe_fmu(target)
     return describe_scenario(target, overrides)
+
+
+def describe_fmu(file: Path) -> str:
+    """An FMU: how it can be used, what it is capable of, its arrays, clocks and variables."""
+    from exlinn_fmi.components.fmu_file import read_description
+
+    d = read_description(file)
+    lines = [f"FMI {d.version}.0, made by {d.tool}"]
+    for use in d.interfaces:
+        can = [word for word, there in use.capabilities() if there]
+        lines.append(f"{use.kind}: {', '.join(can) or 'no more than stepping'}")
+    if d.state_count or d.indicator_count:
+        lines.append(f"{d.state_count} continuous states, {d.indicator_count} event indicators")
+    for name, shape in d.arrays.items():
+        lines.append(f"array {name}[{','.join(map(str, shape))}]")
+    for clock in d.clocks:
+        every = "" if clock.interval is None else f", every {clock.interval:g} s from {clock.shift:g} s on"
+        lines.append(f"clock {clock.name}: {clock.causality}, {clock.kind}{every}")
+    if d.structural:
+        lines.append(f"structural parameters, which size arrays: {', '.join(sorted(d.structural))}")
+    return "\n".join([*lines, "", describe_variables(d.variables)])
 
 
 def describe_variables(variables: Iterable[Variable]) -> str:
@@ -41,6 +61,8 @@ def describe_variables(variables: Iterable[Variable]) -> str:
     for v in variables:
         through = "" if v.causality != "output" else "?" if v.depends_on is None else " ".join(v.depends_on)
         start = "" if v.start is None else f"{v.start:.9g}"
+        if v.start is not None and v.type in TEXT_TYPES:
+            start = repr(shown(v.start))
         rows.append((v.causality, v.name, v.unit or "", v.type, start, through, v.description))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(

@@ -176,7 +176,7 @@ def _present(work: Run, learn: LearnFromPlant, system: LagrangianSystem) -> list
     """The training experiments as they stand, with their steps."""
     from exlinn_fmi.learn.design import Trial
 
-    own = work.scenario.components[learn.plant].start
+    own = work.scenario.components[learn.plant].starts()
     trials = []
     for spec in learn.training:
         start = {**own, **spec.start}

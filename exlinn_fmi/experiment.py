@@ -103,7 +103,7 @@ def excite(work: Run, learn: LearnFromPlant, experiment: Experiment) -> Trajecto
     paths = [p for c in learn.coordinates for p in (c.position, c.velocity, c.acceleration, c.input) if p]
     paths += [f"{plant}.{name}" for name in COMPARED if name in outputs]
     span = Simulate(stop=experiment.duration, step=experiment.step, record=list(dict.fromkeys(paths)))
-    starts = {plant: {**work.scenario.components[plant].start, **experiment.start}}
+    starts = {plant: {**work.scenario.components[plant].starts(), **experiment.start}}
     return cosimulate(work, components, connections, span, starts)
 
 

@@ -122,8 +122,7 @@ def fmu_settings(spec: FmuComponent) -> FmuSettings:
     """How a scenario wants an FMU to be used."""
     from exlinn_fmi.components.fmu import FmuSettings
 
-    numbers = {name: float(value) for name, value in spec.start.items() if isinstance(value, int | float)}
-    return FmuSettings(spec.interface, spec.solver, spec.tolerance, numbers)
+    return FmuSettings(spec.interface, spec.solver, spec.tolerance, spec.starts())
 
 
 def model_system(reference: str, folder: Path, run_folder: Path) -> LagrangianSystem:

@@ -186,7 +186,7 @@ def simulate(work: Run, resume: bool = False) -> None:
         components = with_events(components, scenario.events, scenario.seed, span.step)
         span = span.model_copy(update={"record": [*span.record, f"{MONITOR}.*"]})
     components = with_links(components, scenario.links())
-    starts = {name: spec.start for name, spec in scenario.components.items()}
+    starts = {name: spec.starts() for name, spec in scenario.components.items()}
     store = store_of(work, span, key, resume)
     result = cosimulate(work, components, scenario.connection_list(), span, starts, store)
     stem = work.folder / "trajectories"
@@ -264,7 +264,7 @@ def truth(work: Run) -> dict[str, float]:
         for v in inspect(spec, work.loaded.folder)
         if v.causality == "parameter" and v.start is not None
     }
-    return stated | {name: float(value) for name, value in spec.start.items() if name in stated}
+    return stated | {name: value for name, value in spec.starts().items() if name in stated}
 
 
 def uses_learned(section: Any) -> bool:

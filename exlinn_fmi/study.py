@@ -208,7 +208,7 @@ def one(
         assert span is not None
         most = study_of(work).success
         components = {name: work.component(name) for name in scenario.components}
-        starts = {name: spec.start for name, spec in scenario.components.items()}
+        starts = {name: spec.starts() for name, spec in scenario.components.items()}
         result = cosimulate(work, components, scenario.connection_list(), span, starts)
         judged = control_metrics(result.frame, scenario, result.units)
         error = "" if result.error is None else str(result.error)

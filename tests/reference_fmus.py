@@ -182,3 +182,92 @@ def reference(folder: Path, name: str, version: int, *defines: str) -> Path:
     text = description_2(model) if version == 2 else description_3(model)
     library = binary(version, f"reference{version}.c", f"MODEL={model.number}", *defines)
     return packed(folder, version, text, library, {"y.txt": "a"} if name == "Resource" else None)
+
+
+TYPES = {
+    "Float32": 10,
+    "Int8": 20,
+    "UInt8": 30,
+    "Int16": 40,
+    "UInt16": 50,
+    "Int32": 60,
+    "UInt32": 70,
+    "Int64": 80,
+    "UInt64": 90,
+    "Boolean": 100,
+}
+
+
+def _matrix(name: str, reference: int, dimensions: tuple[int, ...], start: str, more: str = "") -> str:
+    """An array of FMI 3 whose dimensions are structural parameters."""
+    inner = "".join(f'<Dimension valueReference="{d}"/>' for d in dimensions)
+    given = f' start="{start}"' if start else ""
+    return f'<Float64 name="{name}" valueReference="{reference}"{more}{given}>{inner}</Float64>'
+
+
+def feedthrough(folder: Path) -> Path:
+    """All types passed through, a state-space model and clocks, FMI 3 Co-Simulation (feedthrough3.c)."""
+    fixed = ' causality="parameter" variability="tunable"'
+    lines = [
+        f'<UInt64 name="{name}" valueReference="{k}" causality="structuralParameter" start="2"/>'
+        for k, name in enumerate("mnr", 1)
+    ]
+    lines += [
+        _matrix("A", 4, (2, 2), "-1 0 0 -1", fixed),
+        _matrix("B", 5, (2, 1), "1 0 0 1", fixed),
+        _matrix("C", 6, (3, 2), "1 0 0 1", fixed),
+        _matrix("D", 7, (3, 1), "0 0 0 0", fixed),
+        _matrix("x0", 8, (2,), "0 0", fixed),
+        _matrix("u", 9, (1,), "0 0", ' causality="input"'),
+        _matrix("y", 0, (3,), "", ' causality="output"'),
+        _matrix("x", 14, (2,), "", ' causality="output"'),
+    ]
+    for kind, reference in TYPES.items():
+        start = "false" if kind == "Boolean" else "0"
+        lines.append(
+            f'<{kind} name="{kind}_in" valueReference="{reference}" causality="input" start="{start}"/>'
+        )
+        lines.append(f'<{kind} name="{kind}_out" valueReference="{reference + 1}" causality="output"/>')
+    lines += [
+        '<String name="String_in" valueReference="110" causality="input"><Start value="a"/></String>',
+        '<String name="String_out" valueReference="111" causality="output"/>',
+        '<Binary name="Binary_in" valueReference="120" causality="input"><Start value="00ff"/></Binary>',
+        '<Binary name="Binary_out" valueReference="121" causality="output"/>',
+        '<String name="names" valueReference="130" causality="input"><Dimension start="2"/><Start value="p"/>'
+        '<Start value="q"/></String>',
+        '<String name="names_out" valueReference="131" causality="output"><Dimension start="2"/></String>',
+        '<Clock name="tick" valueReference="140" causality="input" intervalVariability="constant" '
+        'intervalDecimal="0.1" shiftDecimal="0.05"/>',
+        '<Int32 name="ticks" valueReference="141" causality="output"/>',
+        '<Clock name="countdown" valueReference="142" causality="input" intervalVariability="countdown"/>',
+        '<Int32 name="counted" valueReference="143" causality="output"/>',
+    ]
+    outputs = [r + 1 for r in (*TYPES.values(), 110, 120, 130, 140, 142)] + [14]
+    structure = '<Output valueReference="0" dependencies="9 14"/>'
+    structure += "".join(f'<Output valueReference="{r}"/>' for r in outputs)
+    text = f"""<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="3.0" modelName="Model" instantiationToken="g">
+<CoSimulation modelIdentifier="Model" hasEventMode="true" canHandleVariableCommunicationStepSize="true"/>
+<ModelVariables>{"".join(lines)}</ModelVariables><ModelStructure>{structure}</ModelStructure>
+</fmiModelDescription>"""
+    return packed(folder, 3, text, binary(3, "feedthrough3.c"))
+
+
+def slave(folder: Path, *defines: str) -> Path:
+    """An FMI 1.0 Co-Simulation FMU (slave1.c)."""
+    text = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="1.0" modelName="Model" modelIdentifier="Model" guid="g"
+  numberOfContinuousStates="0" numberOfEventIndicators="0">
+<ModelVariables>
+<ScalarVariable name="u" valueReference="0" causality="input"><Real start="0"/></ScalarVariable>
+<ScalarVariable name="gain" valueReference="1" variability="parameter"><Real start="2"/></ScalarVariable>
+<ScalarVariable name="x" valueReference="2" causality="output"><Real/></ScalarVariable>
+<ScalarVariable name="minus_x" valueReference="2" alias="negatedAlias" causality="output">
+<Real/></ScalarVariable>
+<ScalarVariable name="n" valueReference="0" causality="input"><Integer start="0"/></ScalarVariable>
+<ScalarVariable name="on" valueReference="0" causality="input"><Boolean start="false"/></ScalarVariable>
+<ScalarVariable name="label" valueReference="0" causality="input"><String start=""/></ScalarVariable>
+</ModelVariables>
+<Implementation><CoSimulation_StandAlone><Capabilities canHandleVariableCommunicationStepSize="true"/>
+</CoSimulation_StandAlone></Implementation></fmiModelDescription>"""
+    return packed(folder, 1, text, binary(1, "slave1.c", *defines))

@@ -352,8 +352,8 @@ class FmuComponent(Component):
 
     @property
     def can_serialize_state(self) -> bool:
-        """Whether `serialize_state` works: the state is all in the FMU, which can turn it into bytes."""
-        return self.description.interface.serializes_state and isinstance(self._stepper, OwnStep)
+        """Whether the FMU says so."""
+        return self.description.interface.serializes_state
 
     def save_state(self) -> object:
         """The FMU's own copy of its state, freed when the object returned is dropped.
@@ -392,7 +392,8 @@ class FmuComponent(Component):
         """
         assert isinstance(state, _SavedState)
         try:
-            return self._instance.serialize(state.pointer)
+            own = np.concatenate([state.snapshot, state.held]).tobytes()
+            return len(own).to_bytes(8, "little") + own + self._instance.serialize(state.pointer)
         except Refused as problem:
             self.take_trouble(problem)
             raise ComponentError(self.name, f"serialising the state failed: {self.message}") from problem
@@ -403,12 +404,15 @@ class FmuComponent(Component):
         Raises:
             ComponentError: the FMU reports an error.
         """
+        begin = 8 + int.from_bytes(data[:8], "little")
+        own = np.frombuffer(data[8:begin])
         try:
-            pointer = self._instance.deserialize(data)
+            pointer = self._instance.deserialize(data[begin:])
         except Refused as problem:
             self.take_trouble(problem)
             raise ComponentError(self.name, f"deserialising the state failed: {self.message}") from problem
-        return _SavedState(self._instance, self._stepper.snapshot(), self._held.copy(), pointer)
+        mine = len(own) - len(self._held)
+        return _SavedState(self._instance, own[:mine].copy(), own[mine:].copy(), pointer)
 
     def close(self) -> None:
         """Terminate and free the instance, unload the binary, give the folder back."""
@@ -464,7 +468,9 @@ class _Plan:
 class _SavedState:
     """A state saved by an FMU, freed with this object."""
 
-    def __init__(self, instance: Instance, snapshot: Any, held: Values, pointer: int | None = None) -> None:
+    def __init__(
+        self, instance: Instance, snapshot: Values, held: Values, pointer: int | None = None
+    ) -> None:
         self.pointer = instance.get_state() if pointer is None else pointer
         self.generation, self.snapshot, self.held = instance.generation, snapshot, held
         weakref.finalize(self, _free_state, instance, self.generation, self.pointer).atexit = False

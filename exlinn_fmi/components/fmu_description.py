@@ -80,6 +80,21 @@ class Interface:
     intermediate_update: bool = False
     completed_step: bool = True
 
+    def capabilities(self) -> list[tuple[str, bool]]:
+        """What it can do beyond the least, in words, and whether it can."""
+        return [
+            ("steps of any length", self.kind == "co_simulation" and not self.equal_steps),
+            ("saves its state", self.saves_state),
+            ("serialises it", self.serializes_state),
+            ("directional derivatives", self.directional_derivatives),
+            ("input derivatives", self.input_derivatives),
+            (f"output derivatives up to order {self.output_derivatives}", self.output_derivatives > 0),
+            ("Event Mode", self.event_mode),
+            ("intermediate update", self.intermediate_update),
+            ("one instance per process only", self.once),
+            ("needs the tool that made it", self.needs_tool),
+        ]
+
 
 @dataclass(frozen=True)
 class Clock:
@@ -202,7 +217,7 @@ def describe(
         for v in model.modelVariables
         if v.causality == "structuralParameter" and v.start is not None
     }
-    negated = {v.get("name") for v in root.iterfind("ModelVariables/*[@variableAlias='negatedAlias']")}
+    negated = {v.get("name") for v in root.iterfind("ModelVariables/*[@alias='negatedAlias']")}
     known = [v for v in model.modelVariables if v.type in _TYPES and v.name not in negated]
     parts = list(_parts(path, version, known, structure, root))
     names = [variable.name for variable, _, _, _ in parts]

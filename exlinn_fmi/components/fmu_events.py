@@ -6,9 +6,11 @@ References: FMI 2.0 §3.2.3, FMI 3.0 §2.2.8 (time-based clocks) and §2.3.5 (Ev
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from ctypes import c_bool, c_double, c_int, c_size_t, c_uint32, c_void_p
 from dataclasses import dataclass
 
+from exlinn_fmi.components.base import Values
 from exlinn_fmi.components.fmu_description import Clock
 from exlinn_fmi.components.fmu_native import Instance, pointer_to
 
@@ -123,15 +125,15 @@ class EventMode:
         self.inside = False
         return Changes(nominals, states)
 
-    def snapshot(self) -> tuple[float, ...]:
+    def snapshot(self) -> list[float]:
         """What `restore` wants."""
-        return (self._announced, *(x for clock in self._clocks for x in (clock.next_tick, clock.interval)))
+        return [self._announced, *(x for clock in self._clocks for x in (clock.next_tick, clock.interval))]
 
-    def restore(self, saved: tuple[float, ...]) -> None:
+    def restore(self, saved: Sequence[float] | Values) -> None:
         """Back to a snapshot; the instance is not in Event Mode."""
-        self._announced = saved[0]
+        self._announced = float(saved[0])
         for k, clock in enumerate(self._clocks):
-            clock.next_tick, clock.interval = saved[1 + 2 * k : 3 + 2 * k]
+            clock.next_tick, clock.interval = map(float, saved[1 + 2 * k : 3 + 2 * k])
         self.inside = False
 
 

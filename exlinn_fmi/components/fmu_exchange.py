@@ -222,16 +222,20 @@ class ModelExchange(Stepper):
 
     # ── state ────────────────────────────────────────────────────────────────────────────────────────────
 
-    def snapshot(self) -> Any:
-        """Time, solver and events; the states are in the FMU."""
+    def snapshot(self) -> Values:
+        """Time, solver and events; the states are in the FMU as well."""
         m = self.model
-        return m.clock.copy(), m.w.copy(), m.z.copy(), self._events.snapshot()
+        return np.concatenate([m.clock, m.w.ravel(), m.z.ravel(), self._events.snapshot()])
 
-    def restore(self, saved: Any) -> None:
+    def restore(self, saved: Values) -> None:
         """Back to a snapshot."""
-        m = self.model
-        m.clock[:], m.w[:], m.z[:] = saved[:3]
-        self._events.restore(saved[3])
+        m, at = self.model, 0
+        for part in (m.clock, m.w, m.z):
+            part[...] = saved[at : at + part.size].reshape(part.shape)
+            at += part.size
+        self._events.restore(saved[at:])
+        stiff = self._choice == "auto" and np.isinf(m.clock[compiled.STIFFNESS])
+        self._solver = self._make("radau" if stiff else self._choice)
 
     # ── failure ──────────────────────────────────────────────────────────────────────────────────────────
 

@@ -261,15 +261,17 @@ class Instance(ABC):
         return code
 
     def accessor(
-        self, verb: str, name: str, references: Any, values: Any
+        self, verb: str, name: str, references: Any, values: Any, sizes: Any = None
     ) -> tuple[Callable[..., int], tuple[Any, ...]]:
-        """A get or set function and its arguments for these buffers, which the caller keeps."""
-        counted = self.description.version == 3
-        function = self.function(
-            f"{verb}{name}", c_void_p, c_void_p, c_size_t, c_void_p, *[c_size_t] * counted
-        )
-        arguments = self.pointer, references.ctypes.data, len(references), values.ctypes.data
-        return function, (*arguments, *[len(values)] * counted)
+        """A get or set function and its arguments for these buffers, which the caller keeps.
+
+        Binaries have a buffer of their sizes as well.
+        """
+        counted, v, z = self.description.version == 3, c_void_p, c_size_t
+        sized = [] if sizes is None else [sizes.ctypes.data]
+        function = self.function(f"{verb}{name}", v, v, z, *[v] * len(sized), v, *[z] * counted)
+        first = self.pointer, references.ctypes.data, len(references)
+        return function, (*first, *sized, values.ctypes.data, *[len(values)] * counted)
 
     def _leave_initialization(self) -> int:
         return self.call("ExitInitializationMode")

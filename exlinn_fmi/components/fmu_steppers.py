@@ -6,8 +6,10 @@ Model Exchange, where the step is ours, is in `fmu_exchange`.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
 
+import numpy as np
+
+from exlinn_fmi.components.base import Values
 from exlinn_fmi.components.fmu_events import EventMode, Stopped, close
 from exlinn_fmi.components.fmu_native import DISCARD, Instance
 from exlinn_fmi.components.fmu_versions import Instance3
@@ -55,11 +57,11 @@ class Stepper(ABC):
         """Make outputs up to date with what was set."""
 
     @abstractmethod
-    def snapshot(self) -> Any:
+    def snapshot(self) -> Values:
         """What `restore` wants, beside the FMU's own state."""
 
     @abstractmethod
-    def restore(self, saved: Any) -> None:
+    def restore(self, saved: Values) -> None:
         """Go back to a snapshot; the FMU's own state is back already."""
 
 
@@ -85,11 +87,11 @@ class OwnStep(Stepper):
     def settle(self) -> None:
         """Nothing to do."""
 
-    def snapshot(self) -> Any:
+    def snapshot(self) -> Values:
         """Nothing: all is in the FMU."""
-        return None
+        return np.zeros(0)
 
-    def restore(self, saved: Any) -> None:
+    def restore(self, saved: Values) -> None:
         """Nothing to do."""
 
 
@@ -142,11 +144,11 @@ class EventedStep(Stepper):
         self._t = end
         return 0
 
-    def snapshot(self) -> Any:
+    def snapshot(self) -> Values:
         """Time and time events."""
-        return self._t, self._events.snapshot()
+        return np.array([self._t, *self._events.snapshot()])
 
-    def restore(self, saved: Any) -> None:
+    def restore(self, saved: Values) -> None:
         """Back to a snapshot."""
-        self._t = saved[0]
-        self._events.restore(saved[1])
+        self._t = float(saved[0])
+        self._events.restore(saved[1:])

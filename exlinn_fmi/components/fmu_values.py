@@ -109,21 +109,18 @@ class Texts(Group):
         self._pointers, self._sizes = np.zeros(count, np.uintp), np.zeros(count, np.uintp)
         self._kept: list[Any] = []
         self._binary = accessor == "Binary"
-        self.function, self.arguments = instance.accessor(verb, accessor, self._references, self._pointers)
-        if self._binary:
-            kinds, arguments = [*self.function.argtypes], [*self.arguments]  # type: ignore[attr-defined]
-            kinds.insert(3, ctypes.c_void_p)
-            arguments.insert(3, self._sizes.ctypes.data)
-            self.function.argtypes, self.arguments = kinds, tuple(arguments)  # type: ignore[attr-defined]
+        sizes = self._sizes if self._binary else None
+        self.function, self.arguments = instance.accessor(
+            verb, accessor, self._references, self._pointers, sizes
+        )
 
     def fill(self, values: Values) -> int | None:
         """See `Group`."""
         self._whole[self._elements] = values[self.positions]
         try:
-            given = [text(number) for number in self._whole]
+            data = [self._encoded(text(number)) for number in self._whole]
         except ValueError:
             return 0
-        data = [value if isinstance(value, bytes) else value.encode() for value in given]
         self._kept = [ctypes.create_string_buffer(value, len(value) + 1) for value in data]
         self._pointers[:] = [ctypes.addressof(kept) for kept in self._kept]
         self._sizes[:] = [len(value) for value in data]
@@ -140,6 +137,12 @@ class Texts(Group):
             self._whole[place] = handle(value)
             values[self._where(values, k)] = self._whole[place]
         return None
+
+    def _encoded(self, value: str | bytes) -> bytes:
+        """As C wants it; a binary that is given as text is in hexadecimal digits."""
+        if isinstance(value, bytes):
+            return value
+        return bytes.fromhex(value) if self._binary else value.encode()
 
     def _where(self, values: Values, k: int) -> int:
         return int(np.arange(len(values))[self.positions][k])

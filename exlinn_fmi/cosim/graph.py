@@ -236,6 +236,8 @@ def _fits(source: Variable, target: Variable) -> bool:
         "Integer": ("Integer", "Boolean", "Enumeration"),
         "Enumeration": ("Integer", "Enumeration"),
         "Boolean": ("Boolean",),
+        "String": ("String",),
+        "Binary": ("Binary",),
     }
     return source.type in accepted[target.type]
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from exlinn_fmi.components.base import Component, Indices, Values
+from exlinn_fmi.components.base import TEXT_TYPES, Component, Indices, Values
 from exlinn_fmi.cosim.order import Port
 from exlinn_fmi.cosim.store import RowFile
 from exlinn_fmi.errors import InputError, nearest
@@ -27,7 +27,7 @@ def select(components: Mapping[str, Component], patterns: Iterable[str]) -> list
     A pattern without ``*`` and ``?`` is the name of one variable of any causality. ``*`` alone stands for all
     inputs and outputs. Other patterns stand for all inputs, outputs and local variables whose
     ``component.variable`` fits, so ``plant.*`` adds the locals of one component; parameters, which stay as
-    they are, are recorded only where named in full.
+    they are, are recorded only where named in full. Texts are not recorded.
 
     Args:
         components: by name.
@@ -45,13 +45,17 @@ def select(components: Mapping[str, Component], patterns: Iterable[str]) -> list
     problems = []
     for pattern in patterns:
         found = [paths[pattern]] if pattern in paths else []
+        if found and parts[found[0][0]].variables[found[0][1]].type in TEXT_TYPES:
+            problems.append(f"record: {pattern} is a text; tables hold numbers only")
         if not found and ("*" in pattern or "?" in pattern):
             causalities = ("input", "output") if pattern == "*" else ("input", "output", "local")
             fits = re.compile(_expression(pattern)).fullmatch
             found = [
                 port
                 for path, port in paths.items()
-                if parts[port[0]].variables[port[1]].causality in causalities and fits(path)
+                if (v := parts[port[0]].variables[port[1]]).causality in causalities
+                and v.type not in TEXT_TYPES
+                and fits(path)
             ]
         if not found and pattern != "*":
             problems.append(f"record: nothing fits {pattern!r}; {nearest(pattern, paths, 'variables')}")

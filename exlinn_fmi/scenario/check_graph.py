@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
+from typing import Any
 
-from exlinn_fmi.components.base import Variable
+from exlinn_fmi.components.base import TEXT_TYPES, Variable
 from exlinn_fmi.components.starts import takes_start, value_problem
 from exlinn_fmi.scenario.explain import Finding
 from exlinn_fmi.scenario.learning import LearnFromData
 from exlinn_fmi.scenario.schema import Link
+from exlinn_fmi.scenario.spec import flat_starts
 from exlinn_fmi.scenario.survey import Survey
 from exlinn_fmi.scenario.units import linear
 from exlinn_fmi.scenario.words import KeyPath, suggestion
@@ -80,7 +82,11 @@ def _misfits(source: str, tail: Variable, target: str, head: Variable, link: Lin
         yield f"unit mismatch: {source} [{tail.unit}] → {target} [{head.unit}]"
     elif changes and head.type != "Real":
         yield f"{target} is of type {head.type}, and the connection changes the value"
-    elif head.type not in ("Real", tail.type) and (tail.type, head.type) not in _FITS:
+    elif (
+        (tail.type in TEXT_TYPES or head.type != "Real")
+        and head.type != tail.type
+        and (tail.type, head.type) not in _FITS
+    ):
         yield f"type mismatch: {source} is {tail.type}, {target} is {head.type}"
 
 
@@ -93,7 +99,7 @@ def start_values(survey: Survey) -> Iterator[Finding]:
 
 
 def misfit_starts(
-    at: KeyPath, starts: Mapping[str, float | bool], component: str, known: Mapping[str, Variable]
+    at: KeyPath, starts: Mapping[str, Any], component: str, known: Mapping[str, Variable]
 ) -> Iterator[Finding]:
     """Start values that the variables of a component do not take.
 
@@ -103,16 +109,21 @@ def misfit_starts(
         component: name of the component.
         known: its variables by name.
     """
-    for name, value in starts.items():
-        variable = known.get(name)
+    for name, value in flat_starts(starts).items():
+        variable, text = known.get(name), isinstance(value, str)
         if variable is None:
             names = [v.name for v in known.values() if takes_start(v)]
             hint = suggestion(name, names, "those that take a start value")
             yield (*at, name), f"{component} has no variable {name!r}{hint}"
         elif not takes_start(variable):
             yield (*at, name), f"{component}.{name} is calculated by the component and takes no start value"
+        elif text != (variable.type in TEXT_TYPES):
+            found = f"text {value!r}" if text else f"{value:g}"
+            yield (*at, name), f"expected {'a number' if text else 'text'}, found {found}"
         elif isinstance(value, bool) and variable.type != "Boolean":
             yield (*at, name), f"expected a number, found {'true' if value else 'false'}"
+        elif text:
+            continue
         elif problem := value_problem(variable, float(value)):
             yield (*at, name), problem
 
@@ -195,6 +206,8 @@ def records(pattern: str, path: str, variable: Variable) -> bool:
     if pattern == path:
         return True
     kinds = ("input", "output") if pattern == "*" else ("input", "output", "local")
+    if variable.type in TEXT_TYPES:
+        return False
     return variable.causality in kinds and fnmatchcase(path, pattern.replace("[", "[[]"))
 
 

@@ -13,18 +13,20 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag
 
+from exlinn_fmi.components.texts import handle
 from exlinn_fmi.scenario.control import Nmpc
 from exlinn_fmi.scenario.events import Event
 from exlinn_fmi.scenario.learning import AnyLearn
 from exlinn_fmi.scenario.signals import Channel, Signal
 from exlinn_fmi.scenario.simulation import Simulate as Simulate
 from exlinn_fmi.scenario.spec import (
+    AnyStart,
     Name,
     NonNegative,
     Positive,
     Spec,
-    StartValue,
     VariablePath,
+    flat_starts,
     form,
     telling_key,
 )
@@ -39,9 +41,15 @@ class ComponentBase(Spec):
     step: Positive | None = Field(
         None, description="own communication step [s]: a multiple of the scenario's; that one if not given"
     )
-    start: dict[str, StartValue] = Field(
-        default_factory=dict, description="start values of parameters, inputs and states, by variable name"
+    start: dict[str, AnyStart] = Field(
+        default_factory=dict,
+        description="start values of parameters, inputs and states, by variable name; lists for arrays",
     )
+
+    def starts(self) -> dict[str, float]:
+        """Start values as components take them: arrays by element, texts by number."""
+        flat = flat_starts(self.start)
+        return {name: handle(v) if isinstance(v, str) else float(v) for name, v in flat.items()}
 
 
 class FmuComponent(ComponentBase):

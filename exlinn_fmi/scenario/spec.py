@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
@@ -38,6 +38,28 @@ VariablePath = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*\..+$", exa
 StartValue = Annotated[
     Annotated[float, Tag("a number")] | Annotated[bool, Tag("true or false")], Discriminator(form)
 ]
+AnyStart = Annotated[
+    Annotated[float, Tag("a number")]
+    | Annotated[bool, Tag("true or false")]
+    | Annotated[str, Tag("text")]
+    | Annotated[list[float] | list[list[float]], Tag("a list")],
+    Discriminator(form),
+]
+
+
+def flat_starts(starts: Mapping[str, Any]) -> dict[str, Any]:
+    """Start values by variable: the elements of lists by the names that the elements of arrays have."""
+    flat: dict[str, Any] = {}
+    for name, value in starts.items():
+        if isinstance(value, list):
+            for k, row in enumerate(value, 1):
+                if isinstance(row, list):
+                    flat |= {f"{name}[{k},{j}]": x for j, x in enumerate(row, 1)}
+                else:
+                    flat[f"{name}[{k}]"] = row
+        else:
+            flat[name] = value
+    return flat
 
 
 class Bounds(Spec):

@@ -164,7 +164,7 @@ def test_the_text_of_the_error_lists_file_line_path_and_count(tmp_path):
         ("inputs: 1e-3", "inputs: {v: -1}", "expected ≥ 0, found -1"),
         ("terminal: dare", "terminal: dara", "expected dare, found text 'dara'; did you mean 'dare'?"),
         ("terminal: dare", "terminal: [1]", "expected 'dare' or a number, found a list"),
-        ("alpha: 1.5", "alpha: up", "expected a number or true or false, found text 'up'"),
+        ("alpha: 1.5", "alpha: up", "expected a number, found text 'up'"),
         ("  ctl.v: plant.v", "  ctl: plant.v", "expected a variable as component.variable, found text 'ctl'"),
         (
             "  ctl.v: plant.v",

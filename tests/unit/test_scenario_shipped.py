@@ -135,7 +135,7 @@ def test_a_right_scenario_fits_the_schema():
         ("band: [0.1, 5], unit: V", "band: [0.1, 5, 6]"),
         ("inputs: 1e-3", "inputs: off"),
         ("terminal: dare", "terminal: dara"),
-        ("alpha: 1.5", "alpha: up"),
+        ("alpha: 1.5", "alpha: {up: 1}"),
         ("  ctl.v: plant.v", "  ctl: plant.v"),
         ("  ctl.v: plant.v", "  ctl.v: plant"),
         ("preset: paper", "preset: papers"),

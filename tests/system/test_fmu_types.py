@@ -1,0 +1,224 @@
+"""Values of all types, arrays with structural parameters, clocks, and FMI 1.0, on FMUs of our own sources."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fmu_helpers import Driver
+from reference_fmus import TYPES, feedthrough, reference, slave
+
+from exlinn_fmi.components.base import Status
+from exlinn_fmi.components.fmu import FmuComponent, FmuSettings, read_variables
+from exlinn_fmi.components.texts import handle, text
+from exlinn_fmi.cosim.graph import Graph
+from exlinn_fmi.cosim.master import Master
+from exlinn_fmi.describe import describe
+from exlinn_fmi.errors import FmuError, InputError
+from exlinn_fmi.scenario.schema import FmuComponent as Spec
+
+
+@pytest.fixture
+def opened() -> Iterator:
+    """Opens an FMU, closed at the end."""
+    with ExitStack() as stack:
+
+        def open_(path: Path, **structure: float) -> Driver:
+            component = FmuComponent("it", path, FmuSettings(structure=structure))
+            return Driver(stack.enter_context(closing(component)))
+
+        yield open_
+
+
+# ── all types ────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("kind", TYPES)
+def test_numbers_of_every_type_pass_through(tmp_path: Path, opened, kind: str) -> None:
+    driver = opened(feedthrough(tmp_path)).begin(h=0.1, stop=1.0)
+    for value in (1.0, 0.0) if kind == "Boolean" else (100.0, 3.0):
+        assert driver.set(**{f"{kind}_in": value}) == Status.OK
+        assert driver.get(f"{kind}_out") == [value]
+
+
+def test_texts_and_binaries_pass_through(tmp_path: Path, opened) -> None:
+    driver = opened(feedthrough(tmp_path)).begin(
+        h=0.1, stop=1.0, String_in=handle("größe"), Binary_in=handle("0aff")
+    )
+    assert [text(x) for x in driver.get("String_out", "Binary_out")] == ["größe", b"\x0a\xff"]
+    driver.set(String_in=handle("then"), Binary_in=handle(b"\0\1\0"))
+    driver.run(1)
+    assert [text(x) for x in driver.get("String_out", "Binary_out")] == ["then", b"\0\1\0"]
+
+
+def test_elements_of_a_text_array_are_set_one_by_one(tmp_path: Path, opened) -> None:
+    driver = opened(feedthrough(tmp_path)).begin(h=0.1, stop=1.0, **{"names[2]": handle("second")})
+    assert [text(x) for x in driver.get("names_out[2]", "names_out[1]")] == ["second", "p"]
+
+
+def test_whole_numbers_beyond_what_float64_holds_are_rounded_with_a_warning(tmp_path: Path, opened) -> None:
+    driver = opened(feedthrough(tmp_path)).begin(h=0.1, stop=1.0)
+    driver.set(Int64_in=2.0**53 + 2)
+    values = np.zeros(1)
+    indices = np.array([driver.component.index("Int64_out")], dtype=np.intp)
+    assert driver.component.get(indices, values) == Status.WARNING
+    assert driver.component.message == "Int64_out is a whole number beyond 2^53 and was rounded"
+    assert values[0] == 2.0**53 + 2
+
+
+def test_texts_are_connected_and_not_recorded(tmp_path: Path) -> None:
+    parts = [(tmp_path / name) for name in ("a", "b")]
+    for part in parts:
+        part.mkdir()
+    graph = {p.name: FmuComponent(p.name, feedthrough(p)) for p in parts}
+    master = Master(Graph(graph, [("a.String_out", "b.String_in")]), 0.0, 1.0, 0.1)
+    assert not any("String" in path or "Binary" in path for path in map(master.graph.path, master.recorded))
+    seen = []
+    get = graph["b"].get
+
+    def watch(indices: np.ndarray, values: np.ndarray) -> Status:
+        status = get(indices, values)
+        one = np.zeros(1)
+        get(np.array([graph["b"].index("String_out")], dtype=np.intp), one)
+        seen.append(text(one[0]))
+        return status
+
+    graph["b"].get = watch  # type: ignore[method-assign]
+    result = master.run({"a": {"String_in": handle("hello")}})
+    assert result.error is None
+    assert seen[-1] == "hello"
+    with pytest.raises(InputError, match="is a text; tables hold numbers only"):
+        Master(master.graph, 0.0, 1.0, 0.1, record=["a.String_out"])
+    with pytest.raises(InputError, match="types do not fit, String into Real"):
+        Graph(graph, [("a.String_out", "b.u[1]")])
+
+
+# ── arrays ───────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_state_space_model_of_the_sizes_asked_for_follows_its_matrices(tmp_path: Path, opened) -> None:
+    a = np.array([[-1.0, 0.5, 0.0], [0.0, -2.0, 0.25], [0.1, 0.0, -0.5]])
+    b, c, d = np.array([[1.0], [0.0], [2.0]]), np.array([[1.0, -1.0, 3.0]]), np.array([[0.5]])
+    spec = Spec(
+        fmu="x",
+        start={"m": 1, "n": 3, "r": 1, "A": a.tolist(), "B": b.tolist(), "C": c.tolist(), "D": d.tolist()}
+        | {"x0": [1.0, 2.0, 3.0]},
+    )
+    driver = opened(feedthrough(tmp_path), **spec.starts()).begin(h=0.01, stop=1.0, **spec.starts())
+    x = np.array([1.0, 2.0, 3.0])
+    for k in range(50):
+        u = np.array([np.sin(0.1 * k)])
+        driver.set(**{"u[1]": u[0]})
+        assert driver.get("y[1]", "x[1]", "x[3]") == pytest.approx([*(c @ x + d @ u), x[0], x[2]], abs=1e-12)
+        # Clocks tick within the step: it is taken in parts, each an Euler step of its own.
+        ends = [
+            t
+            for t in [0.05 + 0.1 * j for j in range(10)]
+            if 0.01 * k < t - 1e-9 and t < 0.01 * (k + 1) - 1e-9
+        ]
+        for start, end in zip([0.01 * k, *ends], [*ends, 0.01 * (k + 1)], strict=True):
+            x = x + (end - start) * (a @ x + b @ u)
+        driver.run(1)
+
+
+def test_elements_of_an_array_keep_what_was_set_before(tmp_path: Path, opened) -> None:
+    driver = opened(feedthrough(tmp_path)).begin(h=0.1, stop=1.0)
+    driver.set(**{"u[1]": 5.0})
+    driver.set(**{"u[2]": 7.0})
+    assert driver.get("u[1]", "u[2]") == [5.0, 7.0]
+
+
+def test_sizes_that_the_fmu_refuses_are_told(tmp_path: Path) -> None:
+    with pytest.raises(FmuError, match="does not take the structural parameters: fmi3SetUInt64"):
+        FmuComponent("it", feedthrough(tmp_path), FmuSettings(structure={"n": 9.0}))
+
+
+def test_structural_parameters_decide_on_the_variables(tmp_path: Path) -> None:
+    names = {
+        v.name for v in read_variables(feedthrough(tmp_path), settings=FmuSettings(structure={"n": 1.0}))
+    }
+    assert {"A[1,1]", "B[1,2]", "x[1]"} <= names
+    assert not {"A[1,2]", "x[2]"} & names
+
+
+# ── clocks ───────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("step", [0.05, 0.1, 1.0])
+def test_periodic_and_countdown_clocks_tick_when_they_should(tmp_path: Path, opened, step: float) -> None:
+    driver = opened(feedthrough(tmp_path)).begin(h=step, stop=4.0)
+    driver.run(round(2.0 / step))
+    # Ticks at 0.05, 0.15, …, 1.95; each fifth starts a countdown: 0.45 → 0.7, 0.95 → 1.2, 1.45 → 1.7.
+    assert driver.get("ticks", "counted") == [20.0, 3.0]
+
+
+# ── FMI 1.0 ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_an_fmi1_slave_integrates_and_passes_its_types_through(tmp_path: Path, opened) -> None:
+    driver = opened(slave(tmp_path)).begin(h=0.1, stop=1.0, gain=3.0, on=True, n=-4, label=handle("x"))
+    driver.set(u=2.0)
+    driver.run(5)
+    assert driver.get("x", "gain", "n", "on") == pytest.approx([3.0, 3.0, -4.0, 1.0], abs=1e-12)
+    assert text(driver.get("label")[0]) == "x"
+    assert "minus_x" not in {v.name for v in driver.component.variables}
+    assert not driver.component.can_save_state
+
+
+def test_an_fmi1_slave_runs_under_the_master_in_both_ways_of_stepping(tmp_path: Path) -> None:
+    frames = []
+    for compiled in (False, True):
+        master = Master(
+            Graph({"it": FmuComponent("it", slave(tmp_path))}, []), 0.0, 1.0, 0.1, compiled=compiled
+        )
+        result = master.run({"it": {"u": 1.0}})
+        assert result.error is None
+        frames.append(result.frame)
+    assert frames[0].equals(frames[1])
+    assert frames[0]["it.x"].iloc[-1] == pytest.approx(2.0)
+
+
+def test_an_error_of_an_fmi1_slave_comes_with_its_words(tmp_path: Path, opened) -> None:
+    driver = opened(slave(tmp_path, "FAULT=3")).begin(h=0.1, stop=1.0)
+    driver.run(5)
+    assert driver.step() == Status.ERROR
+    assert driver.component.message == "fmiDoStep returned fmiError: the bearing is hot"
+
+
+# ── what exlinn info says, and states as bytes ───────────────────────────────────────────────────────────
+
+
+def test_info_shows_uses_capabilities_arrays_and_clocks(tmp_path: Path) -> None:
+    said = describe(feedthrough(tmp_path))
+    assert "co_simulation: steps of any length, Event Mode" in said
+    assert "array A[2,2]" in said
+    assert "clock tick: input, constant, every 0.1 s from 0.05 s on" in said
+    assert "clock countdown: input, countdown" in said
+    assert "structural parameters, which size arrays: m, n, r" in said
+    assert "'00ff'" in said
+    said = describe(reference(tmp_path, "BouncingBall", 2))
+    assert "model_exchange: saves its state, serialises it" in said
+    assert "2 continuous states, 1 event indicators" in said
+
+
+@pytest.mark.parametrize("kind", ["co_simulation", "model_exchange"])
+def test_a_state_goes_on_from_bytes_in_another_instance(tmp_path: Path, kind: str) -> None:
+    path = reference(tmp_path, "BouncingBall", 2)
+    ends = []
+    with (
+        closing(FmuComponent("a", path, FmuSettings(kind))) as one,
+        closing(FmuComponent("b", path, FmuSettings(kind))) as two,
+    ):
+        first, second = Driver(one).begin(h=0.1, stop=4.0), Driver(two).begin(h=0.1, stop=4.0)
+        first.run(8)
+        assert one.can_serialize_state
+        data = one.serialize_state(one.save_state())
+        two.restore_state(two.deserialize_state(data))
+        second.ticks = 8
+        for driver in (first, second):
+            driver.run(10)
+            ends.append(driver.get("h", "v"))
+    assert ends[0] == ends[1]
