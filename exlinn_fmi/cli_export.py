@@ -105,6 +105,53 @@ def model_command(
     typer.echo(str(written))
 
 
+OwnScenario = Annotated[
+    Path | None,
+    typer.Option(help="Scenario of the run, if it names files; that in the run folder if not given."),
+]
+ControllerName = Annotated[
+    str | None, typer.Option("--name", help="Controller in the scenario; the only one if not given.")
+]
+
+
+@app.command("controller")
+def controller_command(
+    folder: Annotated[Path, typer.Argument(help="Run folder.", metavar="FOLDER")],
+    out: Annotated[Path | None, typer.Option(help="FMU to write; Controller.fmu if not given.")] = None,
+    fmi: FmiVersion = Fmi.two,
+    platform: Platforms = None,
+    scenario: OwnScenario = None,
+    name: ControllerName = None,
+) -> None:
+    """Build the NMPC controller of a run, its estimator inside, as a sampled FMU (Co-Simulation).
+
+    Example: exlinn export controller runs/dcwc_tracking --out Controller.fmu
+    """
+    from exlinn_fmi.shipping import Origin, ship_controller
+
+    origin = Origin.find(folder, scenario, name)
+    typer.echo(str(ship_controller(origin, out or Path("Controller.fmu"), options(fmi, platform))))
+
+
+@app.command("loop")
+def loop_command(
+    folder: Annotated[Path, typer.Argument(help="Run folder.", metavar="FOLDER")],
+    out: Annotated[Path | None, typer.Option(help="FMU or SSP to write; Loop.fmu if not given.")] = None,
+    fmi: FmiVersion = Fmi.two,
+    platform: Platforms = None,
+    scenario: OwnScenario = None,
+    name: ControllerName = None,
+) -> None:
+    """Write the controller of a run and its prediction model as a closed loop: one FMU, or two in an .ssp.
+
+    Example: exlinn export loop runs/dcwc_tracking --out Loop.ssp
+    """
+    from exlinn_fmi.shipping import Origin, ship_loop
+
+    origin = Origin.find(folder, scenario, name)
+    typer.echo(str(ship_loop(origin, out or Path("Loop.fmu"), options(fmi, platform))))
+
+
 @app.command("check")
 def check_command(
     fmus: Annotated[list[Path], typer.Argument(help="FMUs to check.", metavar="FMU...")],

@@ -106,7 +106,9 @@ class Kernel:
         self._library = ctypes.CDLL(str(cached_library(kernel_sources(), "nmpc.c", FLAGS)))
         self._library.nmpc_size.restype = ctypes.c_size_t
         self._library.nmpc_array.restype = ctypes.c_void_p
-        self._model, self._keep = _model(ocp)
+        self.packed = pack_networks(ocp.system)
+        """The model's networks as integers and numbers, None where it is a generated function."""
+        self._model, self._keep = _model(ocp, self.packed)
         options = Head(
             states=ocp.n,
             inputs=ocp.m,
@@ -126,6 +128,8 @@ class Kernel:
         )
         size = self._library.nmpc_size(ctypes.byref(options), ctypes.byref(self._model))
         block = np.zeros(size + 8)
+        self.size = size
+        """Doubles in the block."""
         self._block = block[-block.ctypes.data % 64 // 8 :][:size]
         self.head = Head.from_buffer(self._block.data)
         ctypes.memmove(ctypes.byref(self.head), ctypes.byref(options), ctypes.sizeof(Head))
@@ -198,9 +202,10 @@ class Kernel:
         self._library.nmpc_program(*self._call)
 
 
-def _model(ocp: Ocp) -> tuple[_Model, list[object]]:
+def _model(
+    ocp: Ocp, packed: tuple[NDArray[np.int64], NDArray[np.float64]] | None
+) -> tuple[_Model, list[object]]:
     """The model as the kernel takes it, and what has to live as long."""
-    packed = pack_networks(ocp.system)
     if packed is not None:
         integers, numbers = packed
         return _Model(integers=integers.ctypes.data, numbers=numbers.ctypes.data), [integers, numbers]

@@ -24,14 +24,39 @@ from exlinn_fmi.components.base import Component, Indices, Status, Values
 from exlinn_fmi.components.packing import pack, unpack
 from exlinn_fmi.control.defaults import completed, estimator, measure, refined
 from exlinn_fmi.control.diagnosis import diagnose
-from exlinn_fmi.control.estimator import Belief, Sample
+from exlinn_fmi.control.estimator import Belief, Estimator, Sample
 from exlinn_fmi.control.ocp import HORIZON, Ocp, check_names
 from exlinn_fmi.control.reference import ReferenceGenerator, References
-from exlinn_fmi.control.solver import Plan, Solution, SolveStatus, make_solver
+from exlinn_fmi.control.solver import Plan, Solution, Solver, SolveStatus, make_solver
 from exlinn_fmi.errors import InputError, ModelError, nearest
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.scenario.control import Nmpc
 from exlinn_fmi.scenario.derived import nmpc_variables
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a controller is made of, for who builds the same elsewhere.
+
+    Args:
+        ocp: the optimal control problem.
+        estimator: of state and disturbances.
+        generator: of references.
+        solver: of the problem.
+        step: sampling time [s].
+        safe: input where there is nothing better, shape (m,).
+        late: whether an input acts one sample later than what was measured for it.
+        slow: whether that is because the solve takes a sample.
+    """
+
+    ocp: Ocp
+    estimator: Estimator
+    generator: ReferenceGenerator
+    solver: Solver
+    step: float
+    safe: NDArray[np.float64]
+    late: bool
+    slow: bool
 
 
 @dataclass(frozen=True)
@@ -137,6 +162,20 @@ class NmpcController(Component):
         self.notes = (f"solver backend: {self._solver.backend}",)
         if self._solver.reason:
             self.warnings += (f"the solver is not compiled, and far slower: {self._solver.reason}",)
+
+    @property
+    def parts(self) -> Parts:
+        """What it is made of."""
+        return Parts(
+            self._ocp,
+            self._estimator,
+            self._generator,
+            self._solver,
+            self._step,
+            self._safe,
+            self._late,
+            self._slow,
+        )
 
     @property
     def sampled(self) -> bool:

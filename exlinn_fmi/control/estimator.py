@@ -107,9 +107,9 @@ class Estimator(ABC):
     ) -> None:
         self.system, self.noise, self.step = system, noise, step
         self.n, self.d = len(system.state_names), len(noise.disturbed)
-        self._one = Batch(_sensitivities(system, substeps), 1)
-        self._all = Batch(_sensitivities(system, substeps), points) if points > 1 else self._one
-        self._turn = _turns(system)
+        self._one = Batch(sensitivities(system, substeps), 1)
+        self._all = Batch(sensitivities(system, substeps), points) if points > 1 else self._one
+        self.turn = _turns(system)
         self._p = system.parameter_values
 
     def state(self, belief: Belief) -> Float[np.ndarray, " n"]:
@@ -150,7 +150,7 @@ class Estimator(ABC):
     ) -> tuple[Int[np.ndarray, " s"], Float[np.ndarray, " s"]]:
         """Which states were measured, and measured less expected; angles by the shorter way round."""
         seen = np.flatnonzero(np.isfinite(y) & self.noise.measured)
-        difference, turn = y[seen] - mean[seen], self._turn[seen]
+        difference, turn = y[seen] - mean[seen], self.turn[seen]
         with np.errstate(invalid="ignore"):
             turns = np.where(np.isfinite(turn), np.rint(difference / turn) * turn, 0.0)
         return seen, difference - np.nan_to_num(turns)
@@ -221,13 +221,13 @@ class ExtendedKalman(Estimator):
         steady: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
     ) -> None:
         super().__init__(system, noise, step, substeps)
-        self._fixed = None if steady is None else self._steady(*steady)
-        self.settled = steady is None or self._fixed is not None
+        self.fixed = None if steady is None else self._steady(*steady)
+        self.settled = steady is None or self.fixed is not None
         """Whether the filter is as asked for: False where no steady state was found."""
 
     def update(self, belief: Belief, y: Float[np.ndarray, " n"]) -> Belief:
         """Corrected by the gain."""
-        P = belief.covariance if self._fixed is None else self._fixed
+        P = belief.covariance if self.fixed is None else self.fixed
         mean, covariance = self.corrected(belief.mean, P, y)
         return replace(belief, mean=mean, covariance=covariance, y=y)
 
@@ -368,7 +368,7 @@ def _turns(system: LagrangianSystem) -> NDArray[np.float64]:
     return np.array([turns.get(name, np.nan) for name in system.state_names])
 
 
-def _sensitivities(system: LagrangianSystem, substeps: int) -> ca.Function:
+def sensitivities(system: LagrangianSystem, substeps: int) -> ca.Function:
     """One sample and its derivatives: (x, u, (p, f), h) → (x⁺, ∂x⁺/∂x, ∂x⁺/∂f), f the coordinates' forces."""
     loaded = system.loaded()
     step = loaded.rk4(substeps)

@@ -93,7 +93,7 @@ class Trajectory:
             )
         if isinstance(spec.through, Linear) and spec.through.gain == 0.0:
             raise ModelError("through.gain: 0 cannot be inverted; give a number that is not 0")
-        self._through, self._spacing = spec.through, spacing
+        self.through, self._spacing = spec.through, spacing
         self.signal = signal_function(spec.trajectory, folder)
         """The trajectory as given: an error outside the rows of a table that says so."""
         ahead = spec.trajectory
@@ -104,16 +104,16 @@ class Trajectory:
         self.state = system.state_names.index(spec.coordinate)
         """Index of the referenced state."""
         position = positions[self.coordinate]
-        self._position = None if position is None else system.state_names.index(position)
+        self.position = None if position is None else system.state_names.index(position)
 
     @property
     def anchored(self) -> bool:
         """Whether the position that goes with it is counted from the measured one."""
-        return self.velocity and self._position is not None
+        return self.velocity and self.position is not None
 
     def branch(self, measured: Float[np.ndarray, " n"]) -> int:
         """The branch of the kinematics that a measured state (n,) lies on."""
-        return branch_of(self._through, float(measured[self.state]))
+        return branch_of(self.through, float(measured[self.state]))
 
     def motion(
         self, begin: float, count: int, measured: Float[np.ndarray, " n"], branch: int
@@ -121,13 +121,13 @@ class Trajectory:
         """Referenced position and its derivatives at `count` points from `begin` [s] on."""
         spacing = self._spacing
         times = np.asarray(begin + spacing * np.arange(-REACH, count + REACH), dtype=np.float64)
-        samples = coordinate_of(self._through, self.ahead(times), branch)
+        samples = coordinate_of(self.through, self.ahead(times), branch)
         if not self.velocity:
             return derivatives(samples, spacing, ORDERS).T
         motion = np.zeros((count, ORDERS + 1))
         motion[:, 1:] = derivatives(samples, spacing, ORDERS - 1).T
-        if self._position is not None:
-            motion[:, 0] = measured[self._position] + integral(motion[:, 1], motion[:, 2], spacing)
+        if self.position is not None:
+            motion[:, 0] = measured[self.position] + integral(motion[:, 1], motion[:, 2], spacing)
         return motion
 
 

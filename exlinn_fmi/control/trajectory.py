@@ -15,7 +15,7 @@ non-oscillatory schemes III, J. Comput. Phys. 71 (1987).
 from __future__ import annotations
 
 from fractions import Fraction
-from math import factorial, floor, pi
+from math import acos, factorial, floor, pi
 
 import numpy as np
 from jaxtyping import Float
@@ -64,8 +64,9 @@ def coordinate_of(
         # x = d cos α has one solution in each [kπ, (k+1)π]; cos(kπ + β) = ± cos β.
         reach = 1.0 - through.margin
         ratio = np.clip(quantity / through.crank, -reach, reach)
-        angle: NDArray[np.float64] = branch * pi + np.arccos(ratio if branch % 2 == 0 else -ratio)
-        return angle
+        # One by one: numpy's own arccos may differ in the last digit, which differentiation magnifies.
+        angles = [acos(r) for r in (ratio if branch % 2 == 0 else -ratio).tolist()]
+        return branch * pi + np.array(angles)
     if isinstance(through, Linear):
         line: NDArray[np.float64] = (quantity - through.offset) / through.gain
         return line
@@ -87,7 +88,7 @@ def derivatives(samples: Float[np.ndarray, " k"], spacing: float, orders: int) -
     m = len(samples) - 2 * REACH
     centre, sides = REACH // 2, (0, REACH)
     value = samples[REACH : REACH + m]
-    last = np.abs(windows @ _KERNELS[centre][DEGREE])  # the last difference does not depend on the origin
+    last = np.abs(windows @ KERNELS[centre][DEGREE])  # the last difference does not depend on the origin
     choice = np.full(m, centre)
     best = last[centre : centre + m].copy()
     for offset in sides:
@@ -102,14 +103,14 @@ def derivatives(samples: Float[np.ndarray, " k"], spacing: float, orders: int) -
 
     result = np.zeros((orders + 1, m))
     result[0] = value
-    kernels = np.array([_KERNELS[REACH - offset] for offset in range(REACH + 1)])[:, 1 : orders + 1]
+    kernels = np.array([KERNELS[REACH - offset] for offset in range(REACH + 1)])[:, 1 : orders + 1]
     # In a set that begins `offset` windows after the leftmost, the point itself is sample 8 − offset.
     result[1:, smooth] = np.einsum("mps,ms->pm", kernels[choice[smooth]], chosen[smooth])
     if not smooth.all():
         rough = ~smooth
         around = windows[centre : centre + m][rough]
-        fit = around @ _PARABOLA.T  # (k, 3): value, velocity, acceleration
-        misfit = np.abs(fit @ _PARABOLA_BASIS.T - around).max(axis=1)
+        fit = around @ PARABOLA.T  # (k, 3): value, velocity, acceleration
+        misfit = np.abs(fit @ _BASIS_OFPARABOLA.T - around).max(axis=1)
         fit[misfit > PARABOLIC * np.ptp(around, axis=1)] = 0.0
         kept = min(orders, 2)
         result[1 : kept + 1, rough] = fit.T[1 : kept + 1]
@@ -147,6 +148,7 @@ def _interpolation_kernel(position: int) -> NDArray[np.float64]:
     return kernel
 
 
-_KERNELS = [_interpolation_kernel(position) for position in range(DEGREE + 1)]
-_PARABOLA_BASIS = np.array([[1.0, s, s**2 / 2] for s in range(-DEGREE // 2, DEGREE // 2 + 1)])
-_PARABOLA = np.linalg.pinv(_PARABOLA_BASIS)
+KERNELS = [_interpolation_kernel(position) for position in range(DEGREE + 1)]
+"""For each sample of nine, the weights (p, sample) of the derivatives there."""
+_BASIS_OFPARABOLA = np.array([[1.0, s, s**2 / 2] for s in range(-DEGREE // 2, DEGREE // 2 + 1)])
+PARABOLA = np.linalg.pinv(_BASIS_OFPARABOLA)

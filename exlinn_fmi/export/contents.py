@@ -39,7 +39,8 @@ def fmu_members(
     texts = {f"sources/{name}": text for name, text in sources(model, fmi, token).items()}
     texts["modelDescription.xml"] = model_description(model, token, fmi, arrays)
     texts["documentation/index.html"] = card_page(model, card, fmi)
-    texts |= {f"{EXTRA}/{name}": text for name, text in reference_files(model).items()}
+    if model.states:
+        texts |= {f"{EXTRA}/{name}": text for name, text in reference_files(model).items()}
     texts[f"{EXTRA}/provenance.json"] = card.provenance_text()
     if fmi == 3:
         texts["sources/buildDescription.xml"] = _build_description(model)
@@ -68,6 +69,8 @@ def _terminals(model: StateSpaceModel) -> str:
     picture = ET.SubElement(root, "GraphicalRepresentation")
     ET.SubElement(picture, "CoordinateSystem", {**corners, "suggestedScalingFactorTo_mm": "0.1"})
     ET.SubElement(picture, "Icon", {**corners})
+    if not model.terminals:
+        return xml_text(root)
     terminals = ET.SubElement(root, "Terminals")
     for name, kind, members in model.terminals:
         attributes = {"name": name, "matchingRule": "plug", "terminalKind": f"org.exlinn.{kind}"}

@@ -40,6 +40,7 @@ class Quantity:
         role: what it is to the model.
         limits: smallest and largest usual value, None where nothing is known.
         boolean: whether it is a truth value.
+        sampled: whether it changes at ticks only.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Quantity:
     role: Role = "output"
     limits: tuple[float, float] | None = None
     boolean: bool = False
+    sampled: bool = False
 
     @property
     def nominal(self) -> float:
@@ -79,6 +81,8 @@ class StateSpaceModel:
         network: a network that is evaluated apart from the equations, in loops.
         features: z → what the network sees.
         ranges: smallest and largest value of states and inputs that the model was trained with, by name.
+        sample: sampling time of a controller [s], which is for Co-Simulation alone.
+        code: the C code of a controller by file name, in place of what is generated from `equations`.
         terminals: for each coordinate its name, its kind and the variables that belong to it.
     """
 
@@ -95,6 +99,8 @@ class StateSpaceModel:
     network: Network | None = None
     features: ca.Function | None = None
     ranges: Ranges = field(default_factory=dict)
+    sample: float | None = None
+    code: Mapping[str, str] = field(default_factory=dict)
     terminals: tuple[tuple[str, str, tuple[str, ...]], ...] = ()
 
     def __post_init__(self) -> None:
@@ -121,6 +127,8 @@ class StateSpaceModel:
     @property
     def settings(self) -> tuple[Quantity, ...]:
         """How the FMU goes about it."""
+        if self.sample is not None:
+            return ()
         step = "longest internal step of the Runge-Kutta method (Co-Simulation)"
         tolerance = "relative tolerance of adaptive Dormand-Prince steps, 0 for fixed ones (Co-Simulation)"
         clamp = "whether states and inputs enter the equations no farther out than the model was trained"
@@ -331,7 +339,7 @@ def _model(
         expansion.network if expansion else None,
         features,
         {name: seen[name] for name in [*system.state_names, *system.input_names] if name in seen},
-        tuple(map(_terminal, system.coordinates)),
+        terminals=tuple(map(_terminal, system.coordinates)),
     )
     return replace(model, solver_step=_solver_step(model)) if expansion else model
 

@@ -87,8 +87,7 @@ def model_description(model: StateSpaceModel, token: str, fmi: Version = 2, arra
     )
     if fmi == 2:
         root.set("numberOfEventIndicators", str(int(bool(model.ranges))))
-    for element, only in (("ModelExchange", {}), ("CoSimulation", CO_SIMULATION[fmi])):
-        able = dict.fromkeys(CAPABILITIES[fmi], "true") | only
+    for element, able in _interfaces(model, fmi):
         kind = ET.SubElement(root, element, {"modelIdentifier": model.identifier, **able})
         if fmi == 2:
             ET.SubElement(ET.SubElement(kind, "SourceFiles"), "File", name=SOURCE)
@@ -96,11 +95,22 @@ def model_description(model: StateSpaceModel, token: str, fmi: Version = 2, arra
     categories = ET.SubElement(root, "LogCategories")
     for name, text in CATEGORIES.items():
         ET.SubElement(categories, "Category", name=name, description=text)
-    ET.SubElement(root, "DefaultExperiment", startTime="0", stopTime="10", stepSize="0.001")
+    step = repr(model.sample or 0.001)
+    ET.SubElement(root, "DefaultExperiment", startTime="0", stopTime="10", stepSize=step)
     parts = _entries(model, arrays)
     {2: _variables_2, 3: _variables_3}[fmi](root, model, parts)
     {2: _structure_2, 3: _structure_3}[fmi](root, model, _structure(model, parts, arrays))
     return xml_text(root)
+
+
+def _interfaces(model: StateSpaceModel, fmi: Version) -> list[tuple[str, dict[str, str]]]:
+    """The interfaces and what each can do."""
+    able = dict.fromkeys(CAPABILITIES[fmi], "true")
+    if model.sample is None:
+        return [("ModelExchange", able), ("CoSimulation", able | CO_SIMULATION[fmi])]
+    kept = {name: value for name, value in able.items() if "Derivative" not in name}
+    fixed = {"fixedInternalStepSize": repr(model.sample)} if fmi == 3 else {}
+    return [("CoSimulation", {**kept, "canHandleVariableCommunicationStepSize": "true", **fixed})]
 
 
 def xml_text(root: ET.Element) -> str:
@@ -187,7 +197,7 @@ def _class(quantity: Quantity, arrays: bool) -> tuple[str, str, str]:
     if quantity.role == "time":
         return "independent", "continuous", ""
     causality = "local" if quantity.name.startswith("der(") else "output"
-    return causality, "discrete" if quantity.boolean else "continuous", "calculated"
+    return causality, "discrete" if quantity.boolean or quantity.sampled else "continuous", "calculated"
 
 
 def _start(entry: _Entry, model: StateSpaceModel) -> dict[str, str]:
@@ -259,7 +269,7 @@ def _structure(
     def state(i: int) -> int:
         return end if arrays and i < n else i
 
-    every: _Dependencies = {i: (state(i),) for i in range(n)}
+    every: _Dependencies = {i: (state(i),) for i, q in enumerate(model.known) if q.role == "state"}
     every |= {
         first + k: tuple(sorted({state(i) for i in known})) for k, known in enumerate(model.dependencies)
     }
@@ -277,7 +287,8 @@ def _structure_2(
 ) -> None:
     """FMI 2 counts variables from 1."""
     structure = ET.SubElement(root, "ModelStructure")
-    for name, entries in zip(("Outputs", "Derivatives", "InitialUnknowns"), found, strict=True):
+    sections = zip(("Outputs", "Derivatives", "InitialUnknowns"), found, strict=True)
+    for name, entries in ((name, entries) for name, entries in sections if entries):
         section = ET.SubElement(structure, name)
         for k, known in entries.items():
             dependencies = " ".join(str(i + 1) for i in known)

@@ -21,6 +21,8 @@ from exlinn_fmi.toolchain import compile_library, find_compiler
 # No contraction to fused multiply-add: every platform gives the same trajectory. Loops over units are
 # vectorised, which changes no result.
 FLAGS = ("-O3", "-std=c99", "-fvisibility=hidden", "-ffp-contract=off")
+EXPLICIT = ("-O2", *FLAGS[1:])
+"""For a controller, whose vectors are written out: to look for more takes the compiler twice as long."""
 
 
 @dataclass(frozen=True)
@@ -111,13 +113,17 @@ def compile_for(
 
 def _build_here(name: str, files: Mapping[str, bytes], library: str, compiler: str | None) -> bytes:
     """The library for this machine."""
-    return compile_library(files, SOURCE, library, FLAGS, find_compiler(compiler))
+    return compile_library(files, SOURCE, library, _flags(files), find_compiler(compiler))
+
+
+def _flags(files: Mapping[str, bytes]) -> tuple[str, ...]:
+    return EXPLICIT if "controller.c" in files else FLAGS
 
 
 def _build_anywhere(name: str, files: Mapping[str, bytes], library: str, _: str | None) -> bytes:
     """The library for any platform, by ziglang."""
     target = PLATFORMS[name]
-    compiler, flags = [*ZIG, "cc", "-target", target.target], [*FLAGS, "-g0", "-s"]
+    compiler, flags = [*ZIG, "cc", "-target", target.target], [*_flags(files), "-g0", "-s"]
     if target.system == "darwin":
         flags.append(f"-Wl,-install_name,@rpath/{library}")
     if target.system != "win32":

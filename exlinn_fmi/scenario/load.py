@@ -120,6 +120,18 @@ def load_scenario(
     return LoadedScenario(Scenario.model_validate(data), file, file.parent, text, lines, tuple(overrides))
 
 
+def saved_scenario(file: Path) -> Scenario:
+    """The scenario in a run folder: it was checked when it ran, and files that it names lie elsewhere.
+
+    Args:
+        file: ``scenario.yaml`` of a run folder.
+
+    Raises:
+        ScenarioError: there is none.
+    """
+    return Scenario.model_validate(parse(_read(file)).data)
+
+
 def _read(file: Path) -> str:
     """The text of a file.
 

@@ -116,7 +116,7 @@ def test_the_steady_gain_is_where_the_updated_one_goes():
     P = made.predict(run(made, inputs, y)[-1], np.zeros(1)).covariance
     steady = kalman(steady=(np.zeros(2), np.zeros(1)))
     assert steady.settled
-    np.testing.assert_allclose(P, steady._fixed, rtol=1e-6)
+    np.testing.assert_allclose(P, steady.fixed, rtol=1e-6)
     belief = replace(made.begin(np.zeros(2), np.zeros(2)), covariance=np.eye(3))
     np.testing.assert_allclose(
         steady.update(belief, np.array([1.0, np.nan])).mean,
@@ -224,7 +224,7 @@ def test_the_steady_covariance_solves_the_riccati_equation_of_the_filter():
     made = kalman(steady=(np.zeros(2), np.zeros(1)))
     _, F, Q = made.linearised(np.zeros((1, 3)), np.zeros((1, 1)))
     np.testing.assert_allclose(
-        made._fixed, solve_dare(F[0].T, np.eye(3)[:, :1], Q[0], np.array([[1e-4]])), rtol=1e-9
+        made.fixed, solve_dare(F[0].T, np.eye(3)[:, :1], Q[0], np.array([[1e-4]])), rtol=1e-9
     )
 
 

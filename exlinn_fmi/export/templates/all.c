@@ -5,13 +5,18 @@
 #include <float.h>
 #include <math.h>
 #include <stdarg.h>
+#include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "model.h"
 #include "equations.c"
+#if CONTROLLER
+#include "controller.c"
+#else
 #include "core.c"
+#endif
 #if FMI == 2
 #include "fmi2.c"
 #else

@@ -229,6 +229,11 @@ static void refresh_events(State *s)
 #endif
 }
 
+static void start_core(State *s)
+{
+    (void)s; /* a model has nothing to prepare */
+}
+
 /* Change of all values along a direction of the known ones. */
 static void tangent_of_all(State *s, const double *direction, double *change)
 {

@@ -33,7 +33,7 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
 
 void fmi2FreeInstance(fmi2Component c)
 {
-    free(c);
+    destroy(c);
 }
 
 fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const fmi2String categories[])
@@ -55,7 +55,7 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component c)
 {
     Instance *s = c;
     REQUIRE(s, INSTANTIATED);
-    s->state.mode = INITIALIZATION;
+    enter_initialization(s);
     return fmi2OK;
 }
 
@@ -295,10 +295,12 @@ fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference
             return fail(s, "%s: the derivative of %s was set to %g", __func__, NAMES[vr[k]], value[k]);
         }
     }
+#if !CONTROLLER
     for (size_t k = 0; k < n; k++) {
         s->state.slopes[order[k] - 1][vr[k] - FIRST_U] = value[k];
         s->state.moving = 1;
     }
+#endif
     return fmi2OK;
 }
 

@@ -52,7 +52,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
     Instance *s = create(name, token, 1, &importer);
     if (s && event_mode) {
         fail(s, "%s: there is no event mode in Co-Simulation, hasEventMode is false", __func__);
-        free(s);
+        destroy(s);
         s = NULL;
     }
     return s;
@@ -73,7 +73,7 @@ fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token
 
 void fmi3FreeInstance(fmi3Instance c)
 {
-    free(c);
+    destroy(c);
 }
 
 fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean tolerance_defined, fmi3Float64 tolerance,
@@ -84,7 +84,7 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean tolerance_def
     REQUIRE(s, INSTANTIATED);
     const Status status = set_experiment(s, start_time, stop_time_defined, stop_time);
     if (status == OK) {
-        s->state.mode = INITIALIZATION;
+        enter_initialization(s);
     }
     return status;
 }

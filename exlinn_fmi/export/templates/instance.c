@@ -21,7 +21,8 @@ enum { BEFORE_START = INSTANTIATED | INITIALIZATION, RUNNING = STEP | EVENT | CO
 enum { OUTSIDE_OF_STEPS = BEFORE_START | RUNNING | TERMINATED };
 
 typedef struct {
-    State state;
+    State state; /* first, for it has to be aligned */
+    void *memory; /* as it was allocated */
     int co_simulation;
     Importer importer;
     char name[]; /* C99: as long as it was allocated */
@@ -55,7 +56,7 @@ static Status fail(const Instance *s, const char *format, ...)
     return FAILED;
 }
 
-#if RANGED
+#if RANGED || CONTROLLER
 static void warn(const Instance *s, const char *format, ...)
 {
     va_list arguments;
@@ -120,10 +121,13 @@ static void begin(State *s)
 static Instance *create(const char *name, const char *token, int co_simulation, const Importer *importer)
 {
     name = name ? name : "";
-    Instance *s = calloc(1, sizeof *s + strlen(name) + 1);
-    if (!s) {
+    enum { ALIGNED = 64 };
+    char *memory = calloc(1, ALIGNED + sizeof(Instance) + strlen(name) + 1);
+    if (!memory) {
         return NULL;
     }
+    Instance *s = (Instance *)(memory + ALIGNED - (uintptr_t)memory % ALIGNED);
+    s->memory = memory;
     s->co_simulation = co_simulation;
     s->importer = *importer;
     strcpy(s->name, name);
@@ -131,10 +135,24 @@ static Instance *create(const char *name, const char *token, int co_simulation, 
     if (!token || strcmp(token, MODEL_TOKEN)) {
         fail(s, "the token is %s, expected %s: modelDescription.xml and binary are not of one build of "
              MODEL_IDENTIFIER, token ? token : "missing", MODEL_TOKEN);
-        free(s);
+        free(memory);
         return NULL;
     }
+#if CONTROLLER
+    if (!co_simulation) {
+        fail(s, "a controller is for Co-Simulation alone");
+        free(memory);
+        return NULL;
+    }
+#endif
     return s;
+}
+
+static void destroy(Instance *s)
+{
+    if (s) {
+        free(s->memory);
+    }
 }
 
 static Status set_experiment(Instance *s, double start_time, int stop_defined, double stop_time)
@@ -163,6 +181,12 @@ static void mind_range(Instance *s)
     }
     s->state.outside = outside;
 #endif
+}
+
+static void enter_initialization(Instance *s)
+{
+    start_core(&s->state);
+    s->state.mode = INITIALIZATION;
 }
 
 static Status start(Instance *s)
@@ -195,6 +219,18 @@ static Status step(Instance *s, const char *function, double t, double h, double
         return fail(s, "%s: a step from %.9g s to %.9g s goes past the stop time %.9g s", function, t, t + h,
                     s->state.stop_time);
     }
+#if CONTROLLER
+    (void)between;
+    *time = t;
+    *end = h;
+    refresh(&s->state);
+    const double status = s->state.values[M_STATUS];
+    if (s->state.due && status != NMPC_SOLVED) {
+        warn(s, "t = %.9g s: %s", t, status == NMPC_LIMIT ? "the solver ended at its iteration limit"
+                                                          : "the solver failed, the input is the fallback's");
+    }
+    pass(&s->state, h);
+#else
     if (s->state.values[SOLVER_TOLERANCE] == 0.0 && h / s->state.values[SOLVER_STEP] > MOST_STEPS) {
         return fail(s, "%s: a step of %g s in internal steps of %g s is one of too many; make the parameter solver_step "
                     "larger", function, h, s->state.values[SOLVER_STEP]);
@@ -210,6 +246,7 @@ static Status step(Instance *s, const char *function, double t, double h, double
                           NAMES[bad], t, t + h, s->state.values[SOLVER_STEP]);
     }
     mind_range(s);
+#endif
     return OK;
 }
 
@@ -257,6 +294,9 @@ static int settable(int index)
     if (index < FIRST_U) {
         return BEFORE_START | EVENT | CONTINUOUS_TIME;
     }
+#if CONTROLLER && CLOSED
+    return index < N_KNOWN ? BEFORE_START : 0; /* what is measured moves by itself */
+#endif
     if (index < N_KNOWN) {
         return BEFORE_START | RUNNING | (index < FIRST_P ? INTERMEDIATE : 0);
     }
@@ -306,6 +346,7 @@ static Status check_value(const Instance *s, int index, double value)
     if (!(s->state.mode & settable(index))) {
         return fail(s, "%s may not be set in mode '%s'", name, mode_name(s->state.mode));
     }
+#if !CONTROLLER /* which knows what to do without a measurement */
     if (!isfinite(value)) {
         return fail(s, "%s was set to %g at t = %.9g s, expected a finite number", name, value, s->state.values[TIME]);
     }
@@ -315,6 +356,7 @@ static Status check_value(const Instance *s, int index, double value)
     if (index == SOLVER_TOLERANCE && (value < 0.0 || value >= 1.0)) {
         return fail(s, "%s was set to %g, expected 0 or a number below 1", name, value);
     }
+#endif
     return OK;
 }
 
@@ -548,6 +590,18 @@ static Status exchange(Instance *s, const char *function, int (*fits)(int), cons
     return OK;
 }
 
+#if CONTROLLER
+static void tangent_of_all(State *s, const double *direction, double *change)
+{
+    (void)s, (void)direction; /* of a solution there is none: providesDirectionalDerivative is false */
+    for (int i = 0; i < N_VALUES; i++) {
+        change[i] = NAN;
+    }
+}
+
+#define adjoint_of_all tangent_of_all
+#endif
+
 #define UNKNOWN is_unknown, "state, derivative or output"
 #define KNOWN is_known, "state, input or parameter"
 
@@ -587,7 +641,9 @@ static Status output_derivatives(Instance *s, const char *function, const Refere
 
     refresh(&s->state);
     memcpy(direction, s->state.values + FIRST_DX, NX * sizeof *direction);
+#if !CONTROLLER
     memcpy(direction + FIRST_U, s->state.slopes[0], NU * sizeof *direction);
+#endif
     for (size_t k = 0; k < n; k++) {
         if (order[k] != 1) {
             return fail(s, "%s: the derivative of order %d was asked for, maxOutputDerivativeOrder is 1", function,
