@@ -50,6 +50,7 @@ def cosimulate(
         own_steps,
         span.algorithm,
         span.record,
+        profile=span.profile,
         record_every=span.record_every,
         loops=LoopOptions(**loops.model_dump()) if loops else None,
         extrapolation=ExtrapolationOptions(**span.extrapolation.model_dump()) if span.extrapolation else None,

@@ -199,10 +199,13 @@ def simulate(work: Run, resume: bool = False) -> None:
     if result.rows is not None and len(result.frame) < result.rows.rows:
         share = round(result.rows.rows / len(result.frame))
         work.warn(f"metrics and figures are made of every {share}th of {result.rows.rows} rows")
-    statistics = {f"simulate.{k}": v for k, v in result.statistics.items() if isinstance(v, int | float)}
+    told = result.statistics
+    statistics = {f"simulate.{k}": v for k, v in told.items() if isinstance(v, int | float | str)}
+    taken = told.get("component_seconds", {}).items()
+    statistics |= {f"simulate.component_seconds.{name}": seconds for name, seconds in taken}
     judged = control_metrics(result.frame, scenario, result.units)
     work.replace_metrics(("control.", "simulate."), judged | statistics)
-    for name, said in result.statistics["warnings"].items():
+    for name, said in told["warnings"].items():
         work.warn(f"{name}: {said['count']} warnings, the first: {said['first']}")
     if result.error is not None:
         raise work.failed("simulate", result.error)

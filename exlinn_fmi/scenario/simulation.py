@@ -81,6 +81,10 @@ class Simulate(Spec):
         None, description="hold the run to so many simulated seconds per second: 1 is real time"
     )
 
+    profile: bool = Field(
+        False, description="tell in the metrics how much time each component took [s] (costs some itself)"
+    )
+
     @property
     def loop_settings(self) -> Loops | None:
         """How loops are solved, None where they are broken."""

@@ -124,12 +124,14 @@ def test_what_is_recorded_can_be_said_on_the_command_line(tmp_path: Path):
 
 
 def test_a_paced_run_reports_its_deadlines(tmp_path: Path):
-    file = write(tmp_path, "pace: 2")
+    file = write(tmp_path, "pace: 2, profile: true")
     line = ["simulate", str(file), "--out", str(tmp_path / "out"), "--set", "simulate.stop=0.5"]
     assert exit_code(line) == 0
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["simulate.seconds"] >= 0.25
     assert "simulate.missed_deadlines" in metrics
+    assert metrics["simulate.stepping"] == "plain"
+    assert 0 < metrics["simulate.component_seconds.motor"] < metrics["simulate.seconds"]
 
 
 def test_algorithms_are_set_in_the_scenario(tmp_path: Path):
