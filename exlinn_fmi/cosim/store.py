@@ -95,7 +95,7 @@ class RowFile:
         every = 1 if size <= FULL_FRAME else -(-size // THINNED_FRAME)
         parts, first = [np.empty((0, self.columns))], 0
         for block in self.blocks():
-            parts.append(block[-first % every :: every])
+            parts.append(block[-first % every :: every].copy())  # a view would keep all of the block
             first += len(block)
         return np.concatenate(parts)
 
