@@ -305,6 +305,8 @@ class _Search:
         if not near.size:
             return scores
         for k, matrix in zip(near, problem.information(states[near], inputs[near]), strict=True):
+            if not np.isfinite(matrix).all():
+                continue  # on the brink of diverging: states are finite yet, sensitivities are not
             worst = problem.judge(matrix).worst
             scores[k] = min(worst * (1 + 100 * excess[k]), HOPELESS)
             if excess[k] == 0 and worst < self.lowest:

@@ -22,11 +22,11 @@ from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.learn.basis import entry, families, generic_basis
 from exlinn_fmi.learn.discover import COARSE, Discovery, discover, eliminate, least_mass, spread_over
 from exlinn_fmi.learn.iterate import Iterate
-from exlinn_fmi.learn.noise import CLEAN, relative_noise
+from exlinn_fmi.learn.noise import CLEAN, noise_levels, relative_noise
 from exlinn_fmi.learn.projection import Make, solve
 from exlinn_fmi.learn.trajectory import Fit, Information, Shooting, cut, even
 from exlinn_fmi.learn.weak import OVERLAP, Regression, inverse_regression, weak_regression
-from exlinn_fmi.mechanics.coordinates import Parameter
+from exlinn_fmi.mechanics.coordinates import Parameter, state_names
 from exlinn_fmi.mechanics.learned import ModelSpec
 from exlinn_fmi.mechanics.monomials import MonomialBasis
 from exlinn_fmi.mechanics.structure import UNKNOWN, Structure
@@ -37,6 +37,13 @@ Array = NDArray[np.float64]
 Masks = Sequence[NDArray[np.bool_]]
 
 GENERIC = Terms(preset="terms")
+BEYOND = 3.0
+"""Residuals of so many times the noise tell that the terms found are not the whole truth, …"""
+SHORT = 1e-3
+"""… and so does this share of the forces where data are clean."""
+NO_FORMULA = (
+    "no short sum of these terms is true here; take the preset 'structured' or give terms of your own"
+)
 STAGES = 5
 """About as many iterates does the learner give."""
 CONSISTENT = 1e-8
@@ -296,6 +303,12 @@ def prediction_error(basis: MonomialBasis, p: Float[Array, " P"], data: Dataset)
 
 def _notes(basis: MonomialBasis, found: Discovery, why: str, data: Dataset) -> dict[str, Any]:
     """Provenance: the objective and its reason, noise, and the terms with their deviations."""
+    if found.fit.sigma.size:  # of states, as the residuals of trajectories show it
+        excess = float((found.fit.sigma / np.maximum(noise_levels(data), CLEAN * _size(data))).max())
+        if excess > BEYOND:
+            why += f"; they leave residuals of {excess:.3g} times the noise: {NO_FORMULA}"
+    elif (misfit := np.sqrt(force_misfit(found.basis, found.p, data))) > SHORT:
+        why += f"; they leave {100 * misfit:.2g} % of the forces unexplained: {NO_FORMULA}"
     covariance = {
         "of": np.flatnonzero(found.free).tolist(),
         "matrix": found.fit.information.covariance.tolist(),
@@ -306,6 +319,11 @@ def _notes(basis: MonomialBasis, found: Discovery, why: str, data: Dataset) -> d
         "deviations": found.deviations.tolist(),
         "covariance": covariance,
     }
+
+
+def _size(data: Dataset) -> Float[Array, " nx"]:
+    """Standard deviation of each state."""
+    return np.asarray(data.frame[state_names(data.coordinates)].to_numpy(dtype=float).std(axis=0))
 
 
 def term_table(spec: ModelSpec, p: Float[Array, " P"], deviations: Float[Array, " P"]) -> pd.DataFrame:

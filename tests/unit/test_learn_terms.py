@@ -298,3 +298,22 @@ def test_friction_is_found_with_the_speed_where_it_sets_in() -> None:
 def test_a_term_that_would_push_instead_of_rub_is_left_out() -> None:
     basis = MonomialBasis(COORDINATES, ("0.5*i^2",), ("0.5*i^2", "abs(i)^3"))
     assert negative_friction(basis, np.array([1.0, 2.0, -0.1]), clean()).tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize(("noise", "said"), [(0.0, "of the forces unexplained"), (0.01, "times the noise")])
+def test_where_no_short_formula_is_true_the_report_says_so(noise, said) -> None:
+    coordinates = (Coordinate("x", "m", input="f", input_unit="N"),)
+    system = LagrangianSystem.build(
+        coordinates,
+        lambda q, v, p: v[0] ** 2 / 2 + 0.5 * ca.cos(8 * q[0]) - q[0] ** 2,
+        lambda v, p: v[0] ** 2 / 4,
+    )
+    time = np.arange(1500) * 0.01
+    frame = simulate(system, multisine(3, (0.1, 1), 9, 0, 0, time)[:, None], 0.01)
+    for k, name in enumerate(("x", "x_dot")):
+        frame[name] += noise * frame[name].std() * np.random.default_rng(k).standard_normal(len(frame))
+    data = Dataset(frame, coordinates)
+    candidates = Terms(preset="terms", lagrangian=["0.5*x_dot^2", "x^2", "x^4"], dissipation=["0.5*x_dot^2"])
+    model = train(data, data, candidates, seed=0)
+    assert said in model.provenance["objective"]
+    assert "no short sum of these terms" in model.provenance["objective"]
