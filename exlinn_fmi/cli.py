@@ -30,7 +30,9 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-ScenarioFile = Annotated[Path, typer.Argument(help="Scenario file (YAML).", metavar="SCENARIO")]
+ScenarioFile = Annotated[
+    Path, typer.Argument(help="Scenario file (YAML), or a system of SSP.", metavar="SCENARIO")
+]
 Out = Annotated[Path | None, typer.Option("--out", help="Run folder; runs/<scenario name> if not given.")]
 Overrides = Annotated[
     list[str] | None,

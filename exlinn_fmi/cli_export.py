@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from exlinn_fmi.export.build import Options
 
 app = typer.Typer(
-    help="Write an FMU without Python inside, or check one.\n\nExample: exlinn export plant dc_motor_cart",
+    help="Write an FMU without Python inside or a package of SSP, or check an FMU.\n\n"
+    "Example: exlinn export plant dc_motor_cart",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -150,6 +151,32 @@ def loop_command(
 
     origin = Origin.find(folder, scenario, name)
     typer.echo(str(ship_loop(origin, out or Path("Loop.fmu"), options(fmi, platform))))
+
+
+@app.command("ssp")
+def ssp_command(
+    scenario: Annotated[Path, typer.Argument(help="Scenario file (YAML).", metavar="SCENARIO")],
+    out: Annotated[Path | None, typer.Option(help="Package to write; <name>.ssp if not given.")] = None,
+    ssp: Annotated[str, typer.Option("--ssp", help="Version of SSP: 1.0 or 2.0.")] = "1.0",
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY.PATH=VALUE", help="Set a value of the scenario before."),
+    ] = None,
+) -> None:
+    """Write a scenario's components, connections and start values as a package of SSP, FMUs included.
+
+    Example: exlinn export ssp scenarios/two_fmus.yaml --out TwoMotors.ssp
+    """
+    from exlinn_fmi.export.ssp import VERSIONS, write_ssp
+    from exlinn_fmi.factory import outline
+    from exlinn_fmi.workspace import Run
+
+    if ssp not in VERSIONS:
+        raise InputError(f"--ssp: expected {' or '.join(VERSIONS)}, found {ssp!r}")
+    loaded = Run.open(scenario, None, overrides or ()).loaded
+    whole = loaded.scenario
+    variables = {name: outline(name, whole, loaded.folder).variables for name in whole.components}
+    typer.echo(str(write_ssp(loaded, variables, out or Path(f"{whole.name}.ssp"), ssp)))
 
 
 @app.command("check")

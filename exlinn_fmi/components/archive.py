@@ -76,6 +76,7 @@ def read_member(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
 
     Raises:
         FmuError: there is none of that name at the top, or it is too large.
+        BadZipFile: the archive is damaged; `open_archive` tells it.
     """
     names = archive.namelist()
     if name not in names:
@@ -87,7 +88,10 @@ def read_member(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
         raise FmuError(
             f"{path}: {name} is {size / 2**20:.0f} MiB, expected at most {LARGEST_XML / 2**20:.0f} MiB"
         )
-    return archive.read(name)
+    try:
+        return archive.read(name)
+    except OSError as error:  # places in the file that there cannot be
+        raise zipfile.BadZipFile(str(error)) from error
 
 
 def parse_xml(where: str, data: bytes) -> ElementTree.Element:

@@ -8,11 +8,12 @@ alone: a run that is repeated, undone in part or resumed sees the same.
 
 from __future__ import annotations
 
-import copy
+import json
 import math
 import struct
 from collections.abc import Mapping, Sequence
 from hashlib import blake2b
+from typing import Any
 
 import numpy as np
 
@@ -105,6 +106,15 @@ class Effect:
             u, w = self._schedule.uniforms(self._k, t)
             return value + number * math.sqrt(-2 * math.log(u)) * math.cos(2 * math.pi * w)
         return {"set": number, "add": value + number, "scale": value * number, "disconnect": self.start}[kind]
+
+    def memory(self) -> list[Any]:
+        """What it remembers, plain enough for JSON."""
+        return [self.start, self._time, self._before, self._latest, self._kept, self._history]
+
+    def recall(self, memory: list[Any]) -> None:
+        """Remember that instead."""
+        self.start, self._time, self._before, self._latest, self._kept, history = memory
+        self._history = [(t, value) for t, value in history]
 
     def _hold(self, t: float, value: float, active: bool) -> float:
         """The value at the communication point before the event began; at the start of the run, the first."""
@@ -224,16 +234,39 @@ class Touched(Wrapper):
 
     def save_state(self) -> object:
         """The inner component's state and what the effects remember."""
-        kept = {name: getattr(self, name) for name in ("_effects", "_given", "_time", "_lag", "_arrived")}
-        memory = {id(self._schedule): self._schedule}  # shared, so not copied
-        return self.inner.save_state(), copy.deepcopy(kept, memory), list(self._schedule.begins)
+        memory = {
+            "effects": [[effect.memory() for effect in effects] for effects in self._effects.values()],
+            "given": list(self._given.values()),
+            "times": [self._time, self._lag, self._arrived],
+            "connected": sorted(self._connected),
+            "begins": list(self._schedule.begins),
+        }
+        return self.inner.save_state(), json.dumps(memory)
 
     def restore_state(self, state: object) -> None:
         """Go back to a state that `save_state` returned."""
         assert isinstance(state, tuple)
-        inner, kept, self._schedule.begins[:] = state
+        inner, text = state
         self.inner.restore_state(inner)
-        self.__dict__.update(copy.deepcopy(kept, {id(self._schedule): self._schedule}))
+        memory = json.loads(text)
+        for effects, kept in zip(self._effects.values(), memory["effects"], strict=True):
+            for effect, one in zip(effects, kept, strict=True):
+                effect.recall(one)
+        self._given = dict(zip(self._given, memory["given"], strict=True))
+        self._time, self._lag, self._arrived = memory["times"]
+        self._connected = set(memory["connected"])
+        self._schedule.begins[:] = memory["begins"]
+
+    def serialize_state(self, state: object) -> bytes:
+        """The inner component's state and what the effects remember, as bytes."""
+        assert isinstance(state, tuple)
+        inner, text = state
+        return json.dumps([self.inner.serialize_state(inner).hex(), text]).encode()
+
+    def deserialize_state(self, data: bytes) -> object:
+        """A state from bytes."""
+        inner, text = json.loads(data)
+        return self.inner.deserialize_state(bytes.fromhex(inner)), text
 
     def _frozen(self) -> bool:
         return any(self._schedule.active(k, self._time) for k in self._freezing)
@@ -315,6 +348,19 @@ class Monitor(Component):
         """Go back to a time."""
         assert isinstance(state, float)
         self._time = state
+
+    @property
+    def can_serialize_state(self) -> bool:
+        """It is but a number."""
+        return True
+
+    def serialize_state(self, state: object) -> bytes:
+        """The time."""
+        return repr(state).encode()
+
+    def deserialize_state(self, data: bytes) -> object:
+        """The time."""
+        return float(data)
 
     def close(self) -> None:
         """Nothing."""

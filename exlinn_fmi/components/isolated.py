@@ -16,6 +16,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
+
 from exlinn_fmi import errors
 from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
 from exlinn_fmi.components.fmu import FmuComponent, FmuSettings, read_variables
@@ -156,15 +158,11 @@ class IsolatedComponent(Component):
 
     def save_state(self) -> object:
         """A copy of the whole state, which stays in the other process."""
-        if self._settle() >= Status.DISCARD:
-            raise ComponentError(self.name, self.message, time=self._time)
         self._undoable = True
         if self._dropped:
             dropped, self._dropped[:] = self._dropped[:], []
             self._call("forget", dropped, what="freeing a state")
-        state = _SavedState(self._call("save_state", what="saving its state"))
-        weakref.finalize(state, self._dropped.append, state.number).atexit = False
-        return state
+        return self._state(self._call("save_state", what="saving its state"))
 
     def restore_state(self, state: object) -> None:
         """Go back to a state that `save_state` returned in this run."""
@@ -175,17 +173,37 @@ class IsolatedComponent(Component):
     @property
     def can_serialize_state(self) -> bool:
         """As the component itself."""
-        return bool(self._call("can_serialize_state", what="asking for its abilities"))
+        return bool(self._call("ask", "can_serialize_state", what="asking what it can do"))
 
     def serialize_state(self, state: object) -> bytes:
         """A state that `save_state` returned, as bytes."""
         assert isinstance(state, _SavedState)
-        return b64decode(self._call("serialize_state", state.number, what="serialising its state"))
+        return b64decode(self._call("serialize_state", state.number, what="serializing its state"))
 
     def deserialize_state(self, data: bytes) -> object:
-        """A state for `restore_state`, from bytes."""
+        """A state from bytes."""
         text = b64encode(data).decode()
-        return _SavedState(self._call("deserialize_state", text, what="deserialising its state"))
+        return self._state(self._call("deserialize_state", text, what="reading a state"))
+
+    @property
+    def gives_directional_derivatives(self) -> bool:
+        """As the component itself."""
+        return bool(self._call("ask", "gives_directional_derivatives", what="asking what it can do"))
+
+    def directional_derivative(self, unknowns: Indices, knowns: Indices, seed: Values) -> Values:
+        """As the component itself."""
+        given = unknowns.tolist(), knowns.tolist(), seed.tolist()
+        return np.array(self._call("derivative", *given, what="a directional derivative"), dtype=float)
+
+    @property
+    def takes_input_derivatives(self) -> bool:
+        """As the component itself."""
+        return bool(self._call("ask", "takes_input_derivatives", what="asking what it can do"))
+
+    def set_input_derivatives(self, indices: Indices, derivatives: Values) -> Status:
+        """As the component itself."""
+        given = indices.tolist(), derivatives.tolist()
+        return self._status("input_derivatives", *given, what="setting derivatives of inputs")
 
     def close(self) -> None:
         """Close the component and end its process."""
@@ -202,6 +220,12 @@ class IsolatedComponent(Component):
 
     # ── requests ─────────────────────────────────────────────────────────────────────────────────────────
 
+    def _state(self, number: int) -> _SavedState:
+        """A state that the other process keeps under a number, until it is dropped here."""
+        state = _SavedState(number)
+        weakref.finalize(state, self._dropped.append, number).atexit = False
+        return state
+
     def _slot(self, read: bool, indices: Indices) -> _Slot:
         """Where values of these variables lie."""
         key = (read, indices.tobytes())
@@ -209,7 +233,7 @@ class IsolatedComponent(Component):
         if slot is None:
             full = self._free + len(indices) > len(self._process.block)
             if full:
-                self._settle()
+                self._flush()
                 self._slots.clear()
                 self._free = FIRST
             self._call("slot", self._free, indices.tolist(), full, what="laying out memory")
@@ -249,6 +273,15 @@ class IsolatedComponent(Component):
         """
         return self._exchange(EXCHANGE, -1) if self._pending >= 0 or self._posted is not None else Status.OK
 
+    def _flush(self) -> None:
+        """Set what is still to be set.
+
+        Raises:
+            ComponentError: that failed.
+        """
+        if self._pending >= 0 and self._settle() >= Status.DISCARD:
+            raise ComponentError(self.name, self.message, time=self._time)
+
     def _status(self, method: str, *arguments: Any, what: str) -> Status:
         """Call a method that gives a status."""
         status, said = self._request(method, arguments, what)
@@ -261,6 +294,8 @@ class IsolatedComponent(Component):
         return json.loads(self._request(method, arguments, what)[1])
 
     def _request(self, method: str, arguments: Sequence[Any], what: str) -> tuple[int, str]:
+        if method != "slot":
+            self._flush()
         data = json.dumps({"method": method, "arguments": arguments}).encode()
         self._send(REQUEST.pack(CALL, -1, -1, len(data), 0.0, 0.0) + data)
         return self._receive(what)

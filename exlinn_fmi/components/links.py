@@ -38,6 +38,16 @@ class Converted(Wrapper):
             values += known[1]
         return self.inner.set(indices, values)
 
+    @property
+    def takes_input_derivatives(self) -> bool:
+        """As the inner component."""
+        return self.inner.takes_input_derivatives
+
+    def set_input_derivatives(self, indices: Indices, derivatives: Values) -> Status:
+        """Derivatives in the component's own units."""
+        factors = [self._conversions.get(int(k), (1.0, 0.0))[0] for k in indices]
+        return self.inner.set_input_derivatives(indices, derivatives * np.array(factors))
+
 
 def with_links(
     components: Mapping[str, Component], links: Iterable[tuple[str, Link]]

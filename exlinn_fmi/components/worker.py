@@ -173,10 +173,6 @@ class Worker:
         """Go back to a saved state."""
         self._component.restore_state(self._states[number])
 
-    def do_can_serialize_state(self) -> bool:
-        """Whether saved states can be turned into bytes."""
-        return self._component.can_serialize_state
-
     def do_serialize_state(self, number: int) -> str:
         """A saved state as bytes, in base64."""
         return b64encode(self._component.serialize_state(self._states[number])).decode()
@@ -191,6 +187,23 @@ class Worker:
         """Drop saved states."""
         for number in numbers:
             del self._states[number]
+
+    def do_ask(self, name: str) -> Any:
+        """A property of the component."""
+        return getattr(self._component, name)
+
+    def do_derivative(self, unknowns: list[int], knowns: list[int], seed: list[float]) -> list[float]:
+        """A directional derivative."""
+        found: list[float] = self._component.directional_derivative(
+            np.array(unknowns, dtype=np.intp), np.array(knowns, dtype=np.intp), np.array(seed, dtype=float)
+        ).tolist()
+        return found
+
+    def do_input_derivatives(self, indices: list[int], derivatives: list[float]) -> Status:
+        """Derivatives of inputs."""
+        return self._component.set_input_derivatives(
+            np.array(indices, dtype=np.intp), np.array(derivatives, dtype=float)
+        )
 
     # ── pipes ────────────────────────────────────────────────────────────────────────────────────────────
 

@@ -63,6 +63,19 @@ class Wrapper(Component):
         """As the inner component."""
         self.inner.restore_state(state)
 
+    @property
+    def can_serialize_state(self) -> bool:
+        """As the inner component."""
+        return self.inner.can_serialize_state
+
+    def serialize_state(self, state: object) -> bytes:
+        """As the inner component."""
+        return self.inner.serialize_state(state)
+
+    def deserialize_state(self, data: bytes) -> object:
+        """As the inner component."""
+        return self.inner.deserialize_state(data)
+
     def close(self) -> None:
         """Close the inner component."""
         self.inner.close()

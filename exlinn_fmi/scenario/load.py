@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 
+from exlinn_fmi.components.base import Variable
 from exlinn_fmi.errors import Problem, ScenarioError
 from exlinn_fmi.scenario import (
     check_data,
@@ -32,6 +33,7 @@ from exlinn_fmi.scenario.schema import (
     Scenario,
 )
 from exlinn_fmi.scenario.signals import Table
+from exlinn_fmi.scenario.ssp import SUFFIXES, scenario_text
 from exlinn_fmi.scenario.survey import Inspect, survey
 from exlinn_fmi.scenario.words import KeyPath, key_path, missing_file
 
@@ -93,8 +95,11 @@ def load_scenario(
         ScenarioError: with every mistake in the file and the overrides.
     """
     file = Path(path)
-    text = _read(file)
+    is_ssp = file.suffix.lower() in SUFFIXES
+    text, folder = _translated(file, inspect) if is_ssp else (_read(file), file.parent)
     document = parse(text)
+    if is_ssp:
+        document = replace(document, lines={})  # there are none in the file
     problems = list(document.problems)
     if document.data is None and not problems:
         problems.append(Problem("", "the file is empty; a scenario has at least `name` and `components`"))
@@ -109,7 +114,7 @@ def load_scenario(
         problems += [Problem(p.path, f"{p.message} (after the overrides)") for p in overridden.problems]
     if data is not None:
         findings = schema_findings(data, document.faulty)
-        known, more = survey(data, file.parent, inspect)
+        known, more = survey(data, folder, inspect)
         findings += more
         for check in CHECKS:
             findings += check(known)
@@ -117,7 +122,22 @@ def load_scenario(
     if problems:
         raise ScenarioError(str(file), list(dict.fromkeys(problems)))
     lines = {key_path(at): line for at, line in document.lines.items()}
-    return LoadedScenario(Scenario.model_validate(data), file, file.parent, text, lines, tuple(overrides))
+    return LoadedScenario(Scenario.model_validate(data), file, folder, text, lines, tuple(overrides))
+
+
+def _translated(file: Path, inspect: Inspect | None) -> tuple[str, Path]:
+    """The scenario that a system structure (SSP) stands for, and the folder of its files.
+
+    Raises:
+        ScenarioError: the file cannot be used.
+    """
+    if not file.is_file():
+        raise ScenarioError(str(file), [Problem("", missing_file(file.name, file.parent))])
+
+    def look(fmu: Path) -> Sequence[Variable]:
+        return inspect(FmuComponent(fmu=str(fmu)), Path()) if inspect is not None else ()
+
+    return scenario_text(file, look)
 
 
 def saved_scenario(file: Path) -> Scenario:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 
 import numpy as np
 import pandas as pd
@@ -296,8 +297,15 @@ class Undoable(Integrator):
         values, self.time = state
         self.values[:] = values
 
+    def serialize_state(self, state: object) -> bytes:
+        return pickle.dumps(state)
+
+    def deserialize_state(self, data: bytes) -> object:
+        return pickle.loads(data)
+
 
 @given(
+    anew=st.booleans(),
     back=st.integers(1, 6),
     at=st.integers(0, 12),
     effect=st.sampled_from(
@@ -305,7 +313,9 @@ class Undoable(Integrator):
     ),
 )
 @settings(max_examples=60, deadline=None)
-def test_a_run_that_is_undone_and_done_again_is_the_same(back: int, at: int, effect: dict) -> None:
+def test_a_run_that_is_undone_and_done_again_is_the_same(
+    back: int, at: int, effect: dict, anew: bool
+) -> None:
     target = "a" if "freeze" in effect else "a.y"
     waiting = event(on="a.u", when={"variable": "a.y", "above": 0.5}, scale=-1.0)
     components = with_events(
@@ -332,7 +342,7 @@ def test_a_run_that_is_undone_and_done_again_is_the_same(back: int, at: int, eff
         point(k)
     again = max(0, min(at, 13) - back)
     for part, state in zip(parts, states[again], strict=True):
-        part.restore_state(state)
+        part.restore_state(part.deserialize_state(part.serialize_state(state)) if anew else state)
     first, seen[:] = seen[again:], []
     for k in range(again, 14):
         point(k)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import platform
 import stat
@@ -9,10 +10,13 @@ import subprocess
 import warnings
 import zipfile
 from pathlib import Path
+from random import Random
 
 import fmpy
 import pytest
 from fmu_helpers import VARIABLES_2, description_2, description_3, library, pack, probe
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from exlinn_fmi.components import archive
 from exlinn_fmi.components.fmu import FmuComponent, read_variables
@@ -407,3 +411,41 @@ def test_a_description_of_many_variables_is_read_and_a_mistake_at_its_end_told(t
         FmuError, match=r"does not follow FMI 2\.0: TypeError"
     ):  # validation would take minutes
         read_variables(with_description(tmp_path, description_2(variables=wrong)))
+
+
+# ── anything at all ──────────────────────────────────────────────────────────────────────────────────────
+
+
+@given(seed=st.integers(0, 2**32), flips=st.sampled_from([1, 3, 30, 300]))
+@settings(max_examples=150, deadline=None)
+def test_a_damaged_archive_is_told_or_whole(
+    seed: int, flips: int, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("damaged")
+    path = probe(folder)
+    data, random = bytearray(path.read_bytes()), Random(seed)
+    for _ in range(flips):
+        data[random.randrange(len(data))] = random.randrange(256)
+    path.write_bytes(data)
+    with contextlib.suppress(FmuError, StorageError):
+        unpack(read_description(path)).release()
+
+
+@given(seed=st.integers(0, 2**32), version=st.sampled_from([2, 3]))
+@settings(max_examples=150, deadline=None)
+def test_a_damaged_description_is_told_or_read(
+    seed: int, version: int, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    random, text = Random(seed), list(description_2() if version == 2 else description_3())
+    for _ in range(random.choice([1, 2, 5])):
+        at, size = random.randrange(len(text)), random.choice([1, 4, 20])
+        act = random.randrange(3)
+        if act == 0:
+            del text[at : at + size]
+        elif act == 1:
+            start = random.randrange(len(text))
+            text[at:at] = text[start : start + size]
+        else:
+            text[at] = random.choice('<>"=/a0-.9&;')
+    with contextlib.suppress(FmuError):
+        read_variables(with_description(tmp_path_factory.mktemp("damaged"), "".join(text)))

@@ -177,6 +177,57 @@ def test_any_component_can_be_isolated_and_its_exceptions_are_told() -> None:
     component.close()
 
 
+class Square(PythonComponent):
+    """y = u² + x, x' = u, with all that the contract offers."""
+
+    variables = (Variable("u", "input"), Variable("y", "output"), Variable("x", "output", start=0.0))
+
+    def outputs(self, t: float) -> None:
+        self["y"] = self["u"] ** 2 + self["x"]
+
+    def advance(self, t: float, h: float) -> None:
+        self["x"] += h * (self["u"] + self.slope * h / 2)
+
+    slope = 0.0
+    gives_directional_derivatives = True
+    takes_input_derivatives = True
+
+    def directional_derivative(self, unknowns, knowns, seed):
+        assert unknowns.tolist() == [1]
+        assert knowns.tolist() == [0]
+        return 2 * self["u"] * seed
+
+    def set_input_derivatives(self, indices, derivatives):
+        self.slope = float(derivatives[0])
+        return Status.OK
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_all_that_a_component_offers_is_offered(apart: bool, request: pytest.FixtureRequest) -> None:
+    if not apart:
+        request.getfixturevalue("within")
+    one, other = (
+        Driver(IsolatedComponent("s", Square.variables, f"{__name__}:Square", {"name": "s"})).begin()
+        for _ in range(2)
+    )
+    component = one.component
+    assert component.can_serialize_state
+    assert component.gives_directional_derivatives
+    assert component.takes_input_derivatives
+    one.set(u=3.0)
+    derivative = component.directional_derivative(np.array([1]), np.array([0]), np.array([0.5]))
+    assert derivative.tolist() == [3.0]  # with the input that was set just before
+    assert component.set_input_derivatives(np.array([0]), np.array([2.0])) == Status.OK
+    one.step()
+    assert one.get("x") == pytest.approx([0.1 * 3 + 2 * 0.01 / 2])
+    data = component.serialize_state(component.save_state())
+    assert isinstance(data, bytes)
+    other.component.restore_state(other.component.deserialize_state(data))
+    assert other.get("x", "y") == one.get("x", "y")
+    for driver in (one, other):
+        driver.component.close()
+
+
 class Backwards(PythonComponent):
     """Texts and binaries turned round; other numbers stand for them in this process than in its own."""
 
