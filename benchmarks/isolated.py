@@ -2,9 +2,9 @@
 
     python benchmarks/isolated.py [--steps 5000] [--json FILE]
 
-`isolated.us_per_step` is wall time per communication step, without load and start: the least of several runs,
-since two processes that take turns suffer from whatever else runs. `isolated.cpu_us_per_step` is time that
-both processes spend on a processor. `isolated.detect_ms` is from a crash to the error that names it.
+`isolated.us_per_step` is wall time per communication step, without load and start: the median over windows of
+50 steps, since two processes that take turns suffer from whatever else runs, which most windows do not see.
+`isolated.detect_ms` is from a crash to the error that names it.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from exlinn_fmi.components.base import Component
-from exlinn_fmi.components.fmu import FmuComponent
 from exlinn_fmi.components.isolated import isolated_fmu
 from exlinn_fmi.cosim.graph import Graph
 from exlinn_fmi.cosim.master import Master
@@ -26,7 +27,7 @@ from exlinn_fmi.errors import ComponentError
 
 FMU = Path(__file__).parents[1] / "fmus" / "DCMotorCart.fmu"
 STEP = 1e-3
-RUNS = 7
+WINDOW = 50
 
 
 def isolated() -> Component:
@@ -34,24 +35,18 @@ def isolated() -> Component:
     return isolated_fmu("plant", FMU, timeout=60.0, memory=None)
 
 
-def seconds(make: Callable[[], Component], steps: int) -> tuple[float, float]:
-    """Wall time of a run, and processor time of this process and of those that it had [s]."""
-    component = make()
-    before = os.times()
-    result = Master(Graph({"plant": component}, []), 0.0, steps * STEP, STEP).run()
-    after = os.times()
+def us_per_step(make: Callable[[], Component], steps: int) -> float:
+    """Wall time of a step [µs], the median over windows."""
+    times: list[float] = []
+
+    def look() -> bool:
+        times.append(time.perf_counter())
+        return False
+
+    result = Master(Graph({"plant": make()}, []), 0.0, steps * STEP, STEP).run(should_stop=look)
     assert result.error is None, result.error
-    used = sum(after[:4]) - sum(before[:4])  # own and children's, user and system
-    return result.statistics["seconds"], used
-
-
-def per_step(make: Callable[[], Component], steps: int) -> tuple[float, float]:
-    """Wall and processor time of a step [µs], the least of several runs each."""
-    few = max(steps // 10, 1)
-    pairs = [(seconds(make, steps), seconds(make, few)) for _ in range(RUNS)]
-    wall = min(more[0] for more, _ in pairs) - min(less[0] for _, less in pairs)
-    used = min(more[1] for more, _ in pairs) - min(less[1] for _, less in pairs)
-    return 1e6 * wall / (steps - few), 1e6 * used / (steps - few)
+    assert len(times) == steps, "it was not asked after every step"
+    return 1e6 * float(np.median(np.diff(times[::WINDOW]))) / WINDOW
 
 
 def start_ms() -> float:
@@ -87,11 +82,8 @@ def detect_ms() -> float:
 
 def figures(steps: int = 5000) -> dict[str, float]:
     """All figures by name."""
-    wall, used = per_step(isolated, steps)
     return {
-        "isolated.us_per_step": wall,
-        "isolated.cpu_us_per_step": used,
-        "isolated.plain_us_per_step": per_step(lambda: FmuComponent("plant", FMU), steps)[0],
+        "isolated.us_per_step": us_per_step(isolated, steps),
         "isolated.start_ms": start_ms(),
         "isolated.detect_ms": detect_ms(),
     }

@@ -19,7 +19,8 @@ from exlinn_fmi.data.files import write_bytes
 from exlinn_fmi.errors import InputError
 from exlinn_fmi.scenario.load import LoadedScenario, named_files
 from exlinn_fmi.scenario.schema import FmuComponent, ModelComponent, NmpcComponent
-from exlinn_fmi.scenario.ssp import ANNOTATION, FMU, OWN, STRUCTURE
+from exlinn_fmi.scenario.ssp import FMU, OWN, STRUCTURE
+from exlinn_fmi.scenario.ssp_xml import ANNOTATION
 from exlinn_fmi.scenario.units import si_unit
 
 VERSIONS = ("1.0", "2.0")

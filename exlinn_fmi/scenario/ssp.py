@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -23,10 +22,11 @@ from xml.etree import ElementTree
 from ruamel.yaml import YAML
 
 from exlinn_fmi.components.archive import LARGEST_XML, extract, open_archive, parse_xml
-from exlinn_fmi.components.base import SiUnit, Variable
+from exlinn_fmi.components.base import Variable
 from exlinn_fmi.components.cache import Lease, lease
 from exlinn_fmi.errors import InputError, Problem, ScenarioError, StorageError
 from exlinn_fmi.scenario.ssp_system import Bound, Edge, ElementPath, Flat, Node, System, dotted
+from exlinn_fmi.scenario.ssp_xml import annotation, children, first, number, tag_of, transformation, units_of
 
 SUFFIXES = (".ssp", ".ssd")
 STRUCTURE = "SystemStructure.ssd"
@@ -35,14 +35,11 @@ FMU, DEFINITION, PACKAGE = (
 )
 OWN = "application/x-exlinn-component"
 """Type of components that are no FMUs, with their section of a scenario as an annotation."""
-ANNOTATION = "com.github.exlinn"
-"""Type of annotations with what SSP has no words for, as JSON."""
 STEPS = 1000
 """Steps of a run where nothing says how long one is."""
 
 _SOURCES = ("output", "calculatedParameter", "constant", "local")
 _TARGETS = ("input", "parameter", "structuralParameter")
-_BASES = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
 Look = Callable[[Path], Sequence[Variable]]
 """Finds the variables of an FMU."""
@@ -99,30 +96,6 @@ def _unpacked(file: Path) -> Path:
     return _held[-1].folder
 
 
-# ── reading ──────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def _tag(element: ElementTree.Element) -> str:
-    """Name of an element without its namespace, which differs from version to version."""
-    return element.tag.rpartition("}")[2]
-
-
-def _children(element: ElementTree.Element | None, *path: str) -> Iterator[ElementTree.Element]:
-    """Elements down a path of names; ``*`` is any."""
-    if element is None:
-        return
-    if not path:
-        yield element
-        return
-    for child in element:
-        if path[0] in ("*", _tag(child)):
-            yield from _children(child, *path[1:])
-
-
-def _child(element: ElementTree.Element | None, *path: str) -> ElementTree.Element | None:
-    return next(_children(element, *path), None)
-
-
 class _Reader:
     """Gathers a description and all that it names."""
 
@@ -137,11 +110,11 @@ class _Reader:
             InputError: all that is wrong.
         """
         root = self._root(structure, "SystemStructureDescription")
-        self._visit(_child(root, "System"), (), structure, self._units(root), {})
+        self._visit(first(root, "System"), (), structure, units_of(root), {})
         if self.problems:
             raise InputError("\n".join(dict.fromkeys(self.problems)))
         data = Flat(self.system).data()
-        experiment = _child(root, "DefaultExperiment")
+        experiment = first(root, "DefaultExperiment")
         start, stop = (
             float(default if experiment is None else experiment.get(key, default))
             for key, default in (("startTime", "0"), ("stopTime", "1"))
@@ -149,7 +122,7 @@ class _Reader:
         simulate = {"start": start, "stop": stop, "step": (stop - start) / STEPS}
         name = re.sub(r"[^A-Za-z0-9_.-]+", "_", root.get("name") or structure.stem) or "system"
         about = {"name": name, "description": root.get("description") or f"system {root.get('name')}"}
-        return about | data | {"simulate": simulate} | _annotation(root)
+        return about | data | {"simulate": simulate} | annotation(root)
 
     def _root(self, file: Path, tag: str) -> ElementTree.Element:
         """Root of an XML file of SSP.
@@ -163,8 +136,8 @@ class _Reader:
             raise InputError(f"{file.name}: larger than {LARGEST_XML / 2**20:.0f} MiB")
         root = parse_xml(file.name, file.read_bytes())
         version = root.get("version", "")
-        if _tag(root) != tag or not re.match(r"[12]\.\d", version):
-            found = f"<{_tag(root)}> of version {version or '?'}"
+        if tag_of(root) != tag or not re.match(r"[12]\.\d", version):
+            found = f"<{tag_of(root)}> of version {version or '?'}"
             raise InputError(f"{file.name}: found {found}, expected <{tag}> of SSP 1.0 or 2.0")
         return root
 
@@ -197,27 +170,27 @@ class _Reader:
             raise InputError(f"{base.name}: there is no <System> in it")
         self._connectors(element, path, units)
         own = dict(dictionaries)
-        for entry in _children(element, "SignalDictionaries", "SignalDictionary"):
+        for entry in children(element, "SignalDictionaries", "SignalDictionary"):
             own[entry.get("name", "")] = self._dictionary(entry, path, base)
-        for child in _children(element, "Elements", "*"):
+        for child in children(element, "Elements", "*"):
             name = child.get("name", "")
             here = (*path, name)
             self.system.children.setdefault(path, []).append(name)
             try:
-                if _tag(child) == "System":
+                if tag_of(child) == "System":
                     self._visit(child, here, base, units, own)
-                elif _tag(child) == "SignalDictionaryReference":
+                elif tag_of(child) == "SignalDictionaryReference":
                     self._connectors(child, here, units)
                     if child.get("dictionary", "") not in own:
                         raise InputError(
                             f"{dotted(here)}: there is no dictionary {child.get('dictionary')!r}"
                         )
                     self.system.dictionaries[here] = own[child.get("dictionary", "")]
-                elif _tag(child) == "Component":
+                elif tag_of(child) == "Component":
                     self._component(child, here, base, units)
             except InputError as error:
                 self.problems += str(error).splitlines()
-        for connection in _children(element, "Connections", "Connection"):
+        for connection in children(element, "Connections", "Connection"):
             try:
                 self._connect(connection, path)
             except InputError as error:
@@ -236,12 +209,12 @@ class _Reader:
                 inner = _unpacked(file) / (urlsplit(source).fragment or STRUCTURE)
                 self.packaged = True
             root = self._root(inner, "SystemStructureDescription")
-            self._visit(_child(root, "System"), path, inner, self._units(root), {})
+            self._visit(first(root, "System"), path, inner, units_of(root), {})
             self.packaged = packaged
             self._bind(element, path, inner)
             return
         if kind == OWN:
-            section, variables = _annotation(element), dict[str, Variable]()
+            section, variables = annotation(element), dict[str, Variable]()
             if not section:
                 raise InputError(f"{what}: nothing says what kind of component it is")
             if self.packaged and "python" in section:
@@ -258,7 +231,7 @@ class _Reader:
             section |= {"interface": interface} if interface else {}
             if self.packaged:
                 section["isolate"] = True  # it came with the package, whoever made that
-            section |= _annotation(element)
+            section |= annotation(element)
             variables = {v.name: v for v in self.look(file)}
         else:
             raise InputError(f"{what}: components of type {kind!r} cannot be run; expected {FMU}")
@@ -270,7 +243,7 @@ class _Reader:
         self, element: ElementTree.Element, path: ElementPath, units: Mapping[str, Variable]
     ) -> None:
         """Kinds and units of an element's connectors."""
-        for connector in _children(element, "Connectors", "Connector"):
+        for connector in children(element, "Connectors", "Connector"):
             node = (path, connector.get("name", ""))
             self.system.kinds[node] = connector.get("kind", "unspecified")
             for kind in connector:
@@ -280,30 +253,16 @@ class _Reader:
     def _dictionary(self, element: ElementTree.Element, path: ElementPath, base: Path) -> ElementPath:
         """A signal dictionary: signals with units that are seen wherever it is referred to."""
         here = ("dictionary", *path, element.get("name", ""))
-        root = _child(element, "SignalDictionary")
+        root = first(element, "SignalDictionary")
         if root is None:
             file = self._file(element.get("source") or "", base, f"dictionary {here[-1]!r}")
             root = self._root(file, "SignalDictionary")
-        units = self._units(root)
-        for entry in _children(root, "DictionaryEntry"):
+        units = units_of(root)
+        for entry in children(root, "DictionaryEntry"):
             for kind in entry:
                 if kind.get("unit") in units:
                     self.system.units[here, entry.get("name", "")] = units[kind.get("unit", "")]
         return here
-
-    @staticmethod
-    def _units(root: ElementTree.Element) -> dict[str, Variable]:
-        """Units by name, each as the unit of a variable."""
-        found = {}
-        for unit in _children(root, "Units", "Unit"):
-            name, base = unit.get("name", ""), _child(unit, "BaseUnit")
-            si = None
-            if base is not None:
-                kg, m, s, A, K, mol, cd, rad = (int(base.get(key, "0")) for key in _BASES)
-                factor, offset = float(base.get("factor", "1")), float(base.get("offset", "0"))
-                si = SiUnit((kg, m, s, A, K, mol, cd, rad), factor, offset)
-            found[name] = Variable(name, unit=name, si=si)
-        return found
 
     # ── connections ──────────────────────────────────────────────────────────────────────────────────────
 
@@ -317,7 +276,7 @@ class _Reader:
             raise InputError(f"{what}: both of its ends {kind} values")
         forward = one > 0 or other < 0 or (one == 0 and other == 0)
         source, target = (start, end) if forward else (end, start)
-        factor, offset = self._transformation(element, what)
+        factor, offset = transformation(element, what)
         convert = element.get("suppressUnitConversion") not in ("true", "1")
         self.system.edges.setdefault(source, []).append(Edge(target, factor, offset, convert))
 
@@ -340,21 +299,11 @@ class _Reader:
         role = (kind in _SOURCES) - (kind in _TARGETS)
         return (here, connector), role if name else -role
 
-    @staticmethod
-    def _transformation(element: ElementTree.Element, what: str) -> tuple[float, float]:
-        """Factor and offset of a linear transformation."""
-        for child in element:
-            if _tag(child) == "LinearTransformation":
-                return float(child.get("factor", "1")), float(child.get("offset", "0"))
-            if _tag(child).endswith("MappingTransformation"):
-                raise InputError(f"{what}: <{_tag(child)}> is not supported, <LinearTransformation> alone is")
-        return 1.0, 0.0
-
     # ── parameters ───────────────────────────────────────────────────────────────────────────────────────
 
     def _bind(self, element: ElementTree.Element, path: ElementPath, base: Path) -> None:
         """Parameter sets of an element, in their order."""
-        for binding in _children(element, "ParameterBindings", "ParameterBinding"):
+        for binding in children(element, "ParameterBindings", "ParameterBinding"):
             try:
                 values = self._parameters(binding, path, base)
             except InputError as error:
@@ -367,30 +316,30 @@ class _Reader:
     ) -> dict[str, list[Bound]]:
         """Values of one binding by name, after its mapping."""
         what = f"parameters of {dotted(path) or 'the system'}"
-        root = _child(binding, "ParameterValues", "ParameterSet")
+        root = first(binding, "ParameterValues", "ParameterSet")
         if root is None:
             root = self._root(self._source(binding, path, base, what), "ParameterSet")
-        units, prefix = self._units(root), binding.get("prefix") or ""
+        units, prefix = units_of(root), binding.get("prefix") or ""
         items = {
-            e.get("name"): {i.get("name"): i.get("value") for i in _children(e, "Item")}
-            for e in _children(root, "Enumerations", "Enumeration")
+            e.get("name"): {i.get("name"): i.get("value") for i in children(e, "Item")}
+            for e in children(root, "Enumerations", "Enumeration")
         }
         found: dict[str, list[Bound]] = {}
-        for parameter in _children(root, "Parameters", "Parameter"):
+        for parameter in children(root, "Parameters", "Parameter"):
             name = prefix + parameter.get("name", "")
-            kind = next((c for c in parameter if _tag(c) not in ("Dimension", "Annotations")), None)
+            kind = next((c for c in parameter if tag_of(c) not in ("Dimension", "Annotations")), None)
             if kind is not None:
                 known = items.get(kind.get("name"), {})
-                found[name] = [Bound(_number(kind, known, what), units.get(kind.get("unit") or ""))]
-        mapping = _child(binding, "ParameterMapping")
+                found[name] = [Bound(number(kind, known, what), units.get(kind.get("unit") or ""))]
+        mapping = first(binding, "ParameterMapping")
         if mapping is None:
             return found
-        inner = _child(mapping, "ParameterMapping")
+        inner = first(mapping, "ParameterMapping")
         if inner is None:
             inner = self._root(self._source(mapping, path, base, what), "ParameterMapping")
         mapped: dict[str, list[Bound]] = {}
-        for entry in _children(inner, "MappingEntry"):
-            factor, offset = self._transformation(entry, what)
+        for entry in children(inner, "MappingEntry"):
+            factor, offset = transformation(entry, what)
             convert = entry.get("suppressUnitConversion") not in ("true", "1")
             for given in found.get(entry.get("source", ""), ()):
                 value = Bound(given.value, given.unit, factor, offset, convert)
@@ -401,32 +350,3 @@ class _Reader:
         if element.get("sourceBase") == "component":
             raise InputError(f"{what}: files inside of a component are not supported")
         return self._file(element.get("source") or "", base, what)
-
-
-def _annotation(element: ElementTree.Element) -> dict[str, Any]:
-    """What we wrote beside an element, {} where nothing is."""
-    for annotation in _children(element, "Annotations", "Annotation"):
-        if annotation.get("type") == ANNOTATION:
-            try:
-                found = json.loads("".join(annotation.itertext()))
-            except ValueError as error:
-                raise InputError(f"annotation {ANNOTATION}: {error}") from error
-            return found if isinstance(found, dict) else {}
-    return {}
-
-
-def _number(
-    kind: ElementTree.Element, items: Mapping[str | None, str | None], what: str
-) -> float | bool | str:
-    """Value of a parameter as its type has it."""
-    text, tag = kind.get("value", ""), _tag(kind)
-    if tag == "Boolean" and text in ("true", "false", "1", "0"):
-        return text in ("true", "1")
-    if tag in ("String", "Binary"):
-        return text
-    if tag == "Enumeration":
-        text = items.get(text) or text
-    try:
-        return float(text) if tag in ("Real", "Float64", "Float32") else int(text)
-    except ValueError:
-        raise InputError(f"{what}: {text!r} is no value of type {tag}") from None
