@@ -41,7 +41,7 @@ class _Target:
 
     Args:
         inputs: which.
-        places: where their values are in the signal vector.
+        places: where their sources' values are in the signal vector.
         history: the last times and values.
         reached: what the last polynomial ended with.
     """
@@ -82,9 +82,10 @@ class Extrapolation:
         found: dict[int, list[tuple[int, int]]] = {}
         for _, x in plan.visits:
             if x.inputs is not None:
-                for k, place in zip(x.inputs, plan.places(x.given), strict=True):
+                # As they are at their sources: components may change what they are given, e.g. convert units.
+                for k, place in zip(x.inputs, x.sources, strict=True):
                     if (x.component, int(k)) in driven:
-                        found.setdefault(x.component, []).append((int(k), place))
+                        found.setdefault(x.component, []).append((int(k), int(place)))
         for number, pairs in found.items():
             inputs, places = (np.array(part, dtype=np.intp) for part in zip(*pairs, strict=True))
             self._targets[number] = _Target(inputs, places, [])
@@ -108,11 +109,12 @@ class Extrapolation:
             begin = target.reached
             mean = mean + (begin - now) / 2
         target.reached = end
+        # Copies, since the component may change what it is given.
         if component.takes_input_derivatives:
-            status = component.set(target.inputs, begin)
+            status = component.set(target.inputs, begin.copy())
             status = max(status, component.set_input_derivatives(target.inputs, (end - begin) / h))
         else:
-            status = component.set(target.inputs, mean)
+            status = component.set(target.inputs, mean.copy())
         if status != Status.OK:
             self._plan.judge(number, status, "setting extrapolated inputs", t)
 

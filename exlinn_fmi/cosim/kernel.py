@@ -380,7 +380,11 @@ def load() -> Callable[[int], int]:
 
     Other threads of Python run while it does.
     """
-    function = cfunc(types.int64(types.int64), cache=True)(unwrap(_entry))
+    signature, entry = types.int64(types.int64), unwrap(_entry)
+    try:
+        function = cfunc(signature, cache=True)(entry)
+    except RuntimeError:  # there is no folder to keep it in
+        function = cfunc(signature)(entry)
     call: Callable[[int], int] = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)(function.address)
     call.compiled = function  # type: ignore[attr-defined]  # which owns the code
     return call

@@ -10,6 +10,7 @@ from cosim_helpers import Gain, Integrator, graph
 from scipy.linalg import expm
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
+from exlinn_fmi.components.links import Converted
 from exlinn_fmi.components.python import PythonComponent
 from exlinn_fmi.components.signals import SignalSource
 from exlinn_fmi.cosim.adaptive import AdaptiveOptions
@@ -217,6 +218,22 @@ def test_what_is_sampled_is_held():
     held = Master(graph(parts, *wires), 0.0, 1.0, 0.1).run()
     same = Master(graph(parts, *wires), 0.0, 1.0, 0.1, extrapolation=ExtrapolationOptions(2)).run()
     assert held.frame.equals(same.frame)
+
+
+def test_inputs_that_are_converted_on_the_way_are_converted_once():
+    parts = [Mass("a"), Mass("b")]
+    wrapped = Converted(Mass("b"), {0: (-2.0, 0.1)})
+    options = {"extrapolation": ExtrapolationOptions(1)}
+    expected, found = (
+        Master(graph([parts[0], b], "a.x > b.other"), 0.0, 1.0, 0.1, **options).run({"a": {"x": 1.0}})
+        for b in (parts[1], wrapped)
+    )
+    assert found.error is None
+    given = -2.0 * expected.frame["b.other"] + 0.1
+    np.testing.assert_allclose(found.frame["b.other"], given, atol=1e-15)
+    # Linear in the input: with −2 u + 0.1 in place of u, x = −2 x(u) + 0.1 x(1), where x(1) is held.
+    held = Master(graph([Mass("b")]), 0.0, 1.0, 0.1).run({"b": {"other": 1.0}}).frame["b.x"]
+    np.testing.assert_allclose(found.frame["b.x"], -2.0 * expected.frame["b.x"] + 0.1 * held, atol=1e-12)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])

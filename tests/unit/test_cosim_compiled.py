@@ -208,3 +208,15 @@ def test_values_are_found_finite_by_their_bits(values: list[float]):
     array = np.array(values + [-np.nan] * (len(values) == 8), dtype=float)
     found = kernel._finite(array.ctypes.data, len(array))
     assert found == np.isfinite(array).all()
+
+
+def test_the_loop_is_compiled_where_it_cannot_be_kept(monkeypatch: pytest.MonkeyPatch):
+    from exlinn_fmi.cosim import kernel
+
+    def refuse(signature: object, cache: bool = False) -> object:
+        if cache:
+            raise RuntimeError("no locator available")
+        return lambda function: type("Compiled", (), {"address": 1})()
+
+    monkeypatch.setattr(kernel, "cfunc", refuse)
+    assert kernel.load.__wrapped__().compiled.address == 1
