@@ -25,7 +25,9 @@ import fmpy
 import numpy as np
 
 from exlinn_fmi import Run
+from exlinn_fmi.components.fmu import FmuComponent
 from exlinn_fmi.components.lagrangian import LagrangianComponent
+from exlinn_fmi.control.controller import NmpcController
 from exlinn_fmi.export.build import Options, export_learned, export_plant
 from exlinn_fmi.export.card import read_card
 from exlinn_fmi.export.check import check_fmu
@@ -35,6 +37,7 @@ from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.learned import ModelSpec, Scales, Weights, learned_system
 from exlinn_fmi.pipeline import train
 from exlinn_fmi.plants import PLANTS, plant
+from exlinn_fmi.shipping import Origin, ship_controller, ship_loop
 from exlinn_fmi.toolchain import find_compiler
 
 ROOT = Path(__file__).parents[1]
@@ -119,14 +122,15 @@ def exports(quick: bool) -> tuple[Path, ...]:
 
 def validity(quick: bool) -> Figures:
     """FMPy's validation, XML schemas and our own check, and the reference trajectories."""
-    found = [check_fmu(path) for path in exports(quick)]
-    for path, finding in zip(exports(quick), found, strict=True):
+    paths = (*exports(quick), *motor_controller()[1:])
+    found = [check_fmu(path) for path in paths]
+    for path, finding in zip(paths, found, strict=True):
         for problem in finding.problems:
             print(f"{path.name}: {problem}")
     return {
         "validate.fmus": len(found),
         "validate.errors": sum(len(f.problems) for f in found),
-        "validate.reference_max_rel": max(max(f.runs.values(), default=np.inf) for f in found),
+        "validate.reference_max_rel": max(max(f.runs.values(), default=0.0) for f in found),
     }
 
 
@@ -316,6 +320,50 @@ def speed(quick: bool) -> Figures:
     return figures
 
 
+@cache
+def motor_controller() -> tuple[NmpcController, Path, Path]:
+    """The tracking scenario's controller in process, as an FMU, and the loop in one FMU."""
+    run = trained()
+    (run / "scenario.yaml").write_text((ROOT / "scenarios" / "dcwc_tracking.yaml").read_text("utf-8"))
+    origin = Origin.find(run)
+    path = ship_controller(origin, folder("fmus") / "Controller.fmu", Options())
+    return origin.controller(), path, ship_loop(origin, folder("fmus") / "Loop.fmu", Options())
+
+
+def controller(quick: bool) -> Figures:
+    """The controller FMU beside the controller in process, each in a loop of its own with its model, 10 s."""
+    ours, path, _ = motor_controller()
+    system, step, ticks = ours.parts.ocp.system, ours.parts.step, 200 if quick else 1000
+    rows, took = [], []
+    for made in (ours, FmuComponent("fmu", path)):
+        motor = LagrangianComponent("motor", system)
+        for component in (made, motor):
+            component.enter_initialization(0.0, ticks * step, {"alpha": 1.2} if component is motor else {})
+            component.exit_initialization()
+        measured = np.array([motor.index(n) for n in system.state_names])
+        given = np.array([made.index(n) for n in system.state_names])
+        out, v = np.array([made.index("v")]), np.array([motor.index("v")])
+        states, u, seconds = np.zeros(3), np.zeros((ticks, 1)), 0.0
+        for k in range(ticks):
+            motor.get(measured, states)
+            began = time.process_time()
+            made.set(given, states)
+            made.get(out, u[k])
+            made.step(k * step, step)
+            seconds += time.process_time() - began
+            motor.set(v, u[k])
+            motor.step(k * step, step)
+        rows.append(u)
+        took.append(1e6 * seconds / ticks)
+    return {
+        "controller.max_abs_v": float(np.abs(rows[0] - rows[1]).max()),
+        "controller.largest_v": float(np.abs(rows[0]).max()),
+        "controller.in_process_step_us": took[0],
+        "controller.step_us": took[1],
+        "controller.over_in_process": took[1] / took[0],
+    }
+
+
 def platforms(quick: bool) -> Figures:
     """An export for five platforms in one file, the compiler's cache warm but the model new."""
     if not has_zig():
@@ -340,7 +388,7 @@ def fuzz(quick: bool) -> Figures:
     """Random calls, legal and not, under the address and undefined-behaviour sanitisers."""
     calls, findings = 10_000 if quick else 100_000, 0
     sanitise = ("-g", "-O1", "-std=c99", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-    for path in exports(quick):
+    for path in (*exports(quick), *motor_controller()[1:]):
         program = _build("export_fuzz.c", _sources(path), *sanitise)
         for seed in range(1 if quick else 2):
             run = subprocess.run(
@@ -349,7 +397,7 @@ def fuzz(quick: bool) -> Figures:
             if run.returncode:
                 findings += 1
                 print(f"{path.name}, seed {seed}: {run.stderr[:2000]}")
-    return {"fuzz.models": len(exports(quick)), "fuzz.calls": calls, "fuzz.findings": findings}
+    return {"fuzz.models": len(exports(quick)) + 2, "fuzz.calls": calls, "fuzz.findings": findings}
 
 
 FIGURES: dict[str, Callable[[bool], Figures]] = {
@@ -357,6 +405,7 @@ FIGURES: dict[str, Callable[[bool], Figures]] = {
     "importers": importers,
     "parity": parity,
     "speed": speed,
+    "controller": controller,
     "platforms": platforms,
     "fuzz": fuzz,
 }

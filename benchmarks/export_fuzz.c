@@ -19,7 +19,7 @@ static unsigned pick(unsigned below)
     return (unsigned)(seed >> 33) % below;
 }
 
-static double number(void)
+static double any_number(void)
 {
     static const double values[] = {0.0, 1.0, -1.0, 0.5, 3.0, 1e-3, 1e300, -1e300, INFINITY, NAN};
     return pick(9) ? ((double)pick(2000) - 1000.0) / 500.0 : values[pick(sizeof values / sizeof *values)];
@@ -84,14 +84,14 @@ static void update(fmi3InstanceEnvironment e, double time, bool set, bool get, b
 {
     (void)e, (void)set, (void)get, (void)done, (void)early;
     const unsigned r = pick(N_REFERENCES + 2);
-    double values[ROOM] = {number()};
+    double values[ROOM] = {any_number()};
     (pick(2) ? fmi3SetFloat64(handle_of_callback, &r, 1, values, ROOM)
              : fmi3GetFloat64(handle_of_callback, &r, 1, values, ROOM));
     if (pick(20) == 0) {
         fmi3Terminate(handle_of_callback);
     }
     *wanted = pick(4) == 0;
-    *until = pick(4) ? time + span() : number();
+    *until = pick(4) ? time + span() : any_number();
 }
 
 static Handle make(int co_simulation)
@@ -139,7 +139,7 @@ static void values_call(unsigned what)
         r[k] = pick(N_REFERENCES + 3);
     }
     for (int k = 0; k < ROOM; k++) {
-        x[k] = number();
+        x[k] = any_number();
     }
 #if FMI == 2
     int flags[MOST] = {0};
@@ -174,7 +174,7 @@ static void derivative_call(int back)
         u[k] = pick(N_REFERENCES + 1), z[k] = pick(N_REFERENCES + 1);
     }
     for (int k = 0; k < ROOM; k++) {
-        seeds[k] = number();
+        seeds[k] = any_number();
     }
 #if FMI == 2
     (void)back;
@@ -205,7 +205,7 @@ static void model_exchange_call(unsigned what)
     double x[ROOM];
     const size_t n = pick(4) ? (what == 4 ? RANGED : NX) : pick(ROOM);
     for (int k = 0; k < ROOM; k++) {
-        x[k] = number();
+        x[k] = any_number();
     }
     switch (what) {
     case 0: F(SetContinuousStates)(handle, x, n); break;
@@ -217,7 +217,7 @@ static void model_exchange_call(unsigned what)
 #endif
     case 3: F(GetNominalsOfContinuousStates)(handle, x, n); break;
     case 4: F(GetEventIndicators)(handle, x, n); break;
-    case 5: F(SetTime)(handle, number()); break;
+    case 5: F(SetTime)(handle, any_number()); break;
     case 6: F(EnterEventMode)(handle); break;
     case 7: F(EnterContinuousTimeMode)(handle); break;
     default: {
@@ -237,10 +237,10 @@ static void model_exchange_call(unsigned what)
 
 static void co_simulation_call(unsigned what)
 {
-    const double h = span(), t = pick(9) ? now : number();
+    const double h = span(), t = pick(9) ? now : any_number();
     const unsigned r = pick(N_REFERENCES + 1);
     const int order = (int)pick(6);
-    double x[ROOM] = {number()};
+    double x[ROOM] = {any_number()};
 #if FMI == 2
     switch (what) {
     case 0: fmi2SetRealInputDerivatives(handle, &r, 1, &order, x); return;
@@ -278,7 +278,7 @@ int main(int count, char **arguments)
 #if FMI == 2
             (handle);
 #else
-            (handle, 0, 0.0, number(), 1, number());
+            (handle, 0, 0.0, any_number(), 1, any_number());
 #endif
         } else if (what < 35) {
             values_call(pick(6));

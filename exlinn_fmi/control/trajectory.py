@@ -88,7 +88,9 @@ def derivatives(samples: Float[np.ndarray, " k"], spacing: float, orders: int) -
     m = len(samples) - 2 * REACH
     centre, sides = REACH // 2, (0, REACH)
     value = samples[REACH : REACH + m]
-    last = np.abs(windows @ KERNELS[centre][DEGREE])  # the last difference does not depend on the origin
+    # The last difference does not depend on the origin. It is summed sample by sample: where it is rounding
+    # and no more, other code chooses alike only if it rounds alike.
+    last = np.abs(sum(windows[:, s] * KERNELS[centre][DEGREE, s] for s in range(DEGREE + 1)))
     choice = np.full(m, centre)
     best = last[centre : centre + m].copy()
     for offset in sides:
@@ -105,7 +107,8 @@ def derivatives(samples: Float[np.ndarray, " k"], spacing: float, orders: int) -
     result[0] = value
     kernels = np.array([KERNELS[REACH - offset] for offset in range(REACH + 1)])[:, 1 : orders + 1]
     # In a set that begins `offset` windows after the leftmost, the point itself is sample 8 − offset.
-    result[1:, smooth] = np.einsum("mps,ms->pm", kernels[choice[smooth]], chosen[smooth])
+    weights, own = kernels[choice[smooth]], chosen[smooth]
+    result[1:, smooth] = sum(weights[:, :, s].T * own[:, s] for s in range(DEGREE + 1))
     if not smooth.all():
         rough = ~smooth
         around = windows[centre : centre + m][rough]

@@ -179,6 +179,8 @@ def _sizes(
         not in ("status", "reason", "iterations", "rounds", "method", "riccati", "kkt", "cost", "slack")
     )
     return (
+        "/* As many lanes as every processor has: the solver's memory is laid out for no more. */\n"
+        "#if defined(__GNUC__)\n#define LANES 2\n#endif\n"
         '#define NMPC_API static\n#include "nmpc.h"\n\n'
         f"#define KALMAN {int(kalman)}\n#define SLOW {int(parts.slow)}\n#define PI 3.141592653589793\n"
         f"{_enum(sizes)}\nstatic const double SAMPLE = {parts.step!r}, SAME_TIME = {SAME_TIME!r};\n"

@@ -221,6 +221,9 @@ static Status step(Instance *s, const char *function, double t, double h, double
     }
 #if CONTROLLER
     (void)between;
+    if (h / SAMPLE > MOST_STEPS) {
+        return fail(s, "%s: a step of %g s is one of too many samples of %g s", function, h, SAMPLE);
+    }
     *time = t;
     *end = h;
     refresh(&s->state);
