@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import lzma
 import shutil
 import stat
+import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +27,16 @@ LARGEST = 32 * 2**30
 LARGEST_XML = 256 * 2**20
 """Bytes of XML that are read at most: a compressed file of 1 MB can unpack to gigabytes."""
 
-_UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
+_UNREADABLE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    struct.error,
+    EOFError,
+    ValueError,
+    OverflowError,
+    RuntimeError,
+)
 """What zipfile raises for damaged, encrypted and unknown contents."""
 
 

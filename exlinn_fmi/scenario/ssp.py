@@ -64,6 +64,12 @@ def scenario_text(file: Path, look: Look) -> tuple[str, Path]:
         data = reader.scenario(structure)
     except InputError as error:
         raise ScenarioError(str(file), [Problem("", line) for line in str(error).splitlines()]) from error
+    except ValueError as error:  # of int and float: an attribute that SSP has as a number
+        raise ScenarioError(str(file), [Problem("", f"an attribute is no number: {error}")]) from error
+    except RecursionError as error:
+        raise ScenarioError(
+            str(file), [Problem("", "systems are nested too deeply, or in each other")]
+        ) from error
     stream = io.StringIO()
     yaml = YAML()
     yaml.width = 4096

@@ -106,9 +106,9 @@ class Flat:
 
     def _reach(self, start: Node, unit: Variable | None) -> Iterator[tuple[Node, float, float, bool]]:
         """Components' connectors that a value comes to; factor, offset, and whether these must be stated."""
-        ahead = [(start, 1.0, 0.0, unit, False, frozenset([start]))]
+        ahead, seen = [(start, 1.0, 0.0, unit, False)], {start}
         while ahead:
-            node, factor, offset, unit, changed, seen = ahead.pop(0)
+            node, factor, offset, unit, changed = ahead.pop(0)
             for edge in self.system.edges.get(node, ()):
                 to = self._variable(edge.target)
                 step = self._conversion(unit, to, node, edge)
@@ -118,7 +118,8 @@ class Flat:
                 if edge.target[0] in self.system.sections:
                     yield edge.target, *state, must
                 elif edge.target not in seen:
-                    ahead.append((edge.target, *state, to or unit, must, seen | {edge.target}))
+                    seen.add(edge.target)
+                    ahead.append((edge.target, *state, to or unit, must))
 
     def _conversion(
         self, unit: Variable | None, to: Variable | None, node: Node, edge: Edge

@@ -15,7 +15,7 @@ from random import Random
 import fmpy
 import pytest
 from fmu_helpers import VARIABLES_2, description_2, description_3, library, pack, probe
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from exlinn_fmi.components import archive
@@ -416,16 +416,17 @@ def test_a_description_of_many_variables_is_read_and_a_mistake_at_its_end_told(t
 # ── anything at all ──────────────────────────────────────────────────────────────────────────────────────
 
 
-@given(seed=st.integers(0, 2**32), flips=st.sampled_from([1, 3, 30, 300]))
-@settings(max_examples=150, deadline=None)
+@given(seed=st.integers(0, 2**32), flips=st.sampled_from([1, 3, 30, 300]), last=st.sampled_from([400, 10**6]))
+@example(seed=73806, flips=300, last=10**6)  # a name that is no UTF-8
+@settings(max_examples=200, deadline=None)
 def test_a_damaged_archive_is_told_or_whole(
-    seed: int, flips: int, tmp_path_factory: pytest.TempPathFactory
+    seed: int, flips: int, last: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.mktemp("damaged")
     path = probe(folder)
     data, random = bytearray(path.read_bytes()), Random(seed)
     for _ in range(flips):
-        data[random.randrange(len(data))] = random.randrange(256)
+        data[random.randrange(max(0, len(data) - last), len(data))] = random.randrange(256)
     path.write_bytes(data)
     with contextlib.suppress(FmuError, StorageError):
         unpack(read_description(path)).release()

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import zipfile
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pandas as pd
 import pytest
 from fmu_helpers import description_2, pack, probe
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from exlinn_fmi import cli
 from exlinn_fmi.errors import ScenarioError
@@ -337,6 +341,54 @@ def test_a_package_that_cannot_be_used_says_why(tmp_path: Path, text: str, messa
         load(package(tmp_path, text))
     assert message in str(error.value)
     assert str(error.value).startswith(str(tmp_path / "system.ssp"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('stopTime="2"', 'stopTime="soon"'),
+        ('m="1" s="-1"/>', 'm="1.5" s="-1"/>'),
+        ('factor="0.27', 'factor="x0.27'),
+    ],
+)
+def test_attributes_that_are_no_numbers_are_told(tmp_path: Path, old: str, new: str) -> None:
+    with pytest.raises(ScenarioError, match="an attribute is no number: "):
+        load(package(tmp_path, structure(system(fmu("a"))).replace(old, new, 1)))
+
+
+def test_a_description_within_itself_is_told(tmp_path: Path) -> None:
+    own = '<ssd:Component name="a" type="application/x-ssp-definition" source="SystemStructure.ssd"/>'
+    with pytest.raises(ScenarioError, match="systems are nested too deeply, or in each other"):
+        load(package(tmp_path, structure(system(own))))
+
+
+def test_connectors_in_a_circle_end(tmp_path: Path) -> None:
+    head = f"<ssd:Connectors>{connector('one', 'inout')}{connector('two', 'inout')}</ssd:Connectors>"
+    circle = connection("one", "two") + connection("two", "one") + connection("two", "p.u")
+    sub = system(fmu("p"), circle, head, "sub")
+    text = structure(system(sub + fmu("a"), connection("a.y", "sub.one")))
+    assert set(links(package(tmp_path, text))) == {"a.y sub_p.u"}
+
+
+@given(seed=st.integers(0, 2**32))
+@settings(max_examples=100, deadline=None)
+def test_a_damaged_description_is_told_or_read(seed: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+    random = Random(seed)
+    head = f"<ssd:Connectors>{connector('in', 'input')}</ssd:Connectors>"
+    sub = system(fmu("p", parameters({"gain": 1.0})), connection("in", "p.u"), head, "sub")
+    text = list(structure(system(sub + fmu("a"), connection("a.y", "sub.in"))))
+    for _ in range(random.choice([1, 2, 5])):
+        at, size = random.randrange(len(text)), random.choice([1, 4, 20])
+        if random.random() < 0.5:
+            del text[at : at + size]
+        else:
+            text[at] = random.choice('<>"=/a0-.9&;')
+    folder = tmp_path_factory.mktemp("damaged")
+    (folder / "resources").mkdir()
+    probe(folder / "resources")
+    (folder / "x.ssd").write_text("".join(text))
+    with contextlib.suppress(ScenarioError):
+        load(folder / "x.ssd")
 
 
 def test_all_problems_are_told_at_once(tmp_path: Path) -> None:
