@@ -17,9 +17,10 @@ import numpy as np
 from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
 from exlinn_fmi.components.cache import Lease
 from exlinn_fmi.components.fmu_calls import FmuNative
-from exlinn_fmi.components.fmu_description import FmuDescription, Kind
+from exlinn_fmi.components.fmu_description import FmuDescription
 from exlinn_fmi.components.fmu_events import Stopped
 from exlinn_fmi.components.fmu_file import check_runnable, read_description, unpack
+from exlinn_fmi.components.fmu_interfaces import Kind
 from exlinn_fmi.components.fmu_native import (
     Instance,
     Refused,

@@ -17,7 +17,8 @@ import fmpy
 
 from exlinn_fmi.components.archive import extract, open_archive, parse_xml, read_member
 from exlinn_fmi.components.cache import Lease, lease
-from exlinn_fmi.components.fmu_description import FmuDescription, Kind, describe
+from exlinn_fmi.components.fmu_description import FmuDescription, describe
+from exlinn_fmi.components.fmu_interfaces import Kind
 from exlinn_fmi.errors import FmuError, StorageError
 
 DESCRIPTION = "modelDescription.xml"

@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from exlinn_fmi.components.fmu_description import FmuDescription, Kind
+from exlinn_fmi.components.fmu_description import FmuDescription
+from exlinn_fmi.components.fmu_interfaces import Kind
 from exlinn_fmi.components.native import NativeStep
 from exlinn_fmi.errors import FmuError
 

@@ -14,7 +14,8 @@ from typing import Any
 import fmpy
 from fmpy import fmi1, fmi2, fmi3
 
-from exlinn_fmi.components.fmu_description import FmuDescription, Kind
+from exlinn_fmi.components.fmu_description import FmuDescription
+from exlinn_fmi.components.fmu_interfaces import Kind
 from exlinn_fmi.components.fmu_native import (
     DISCARD,
     Instance,

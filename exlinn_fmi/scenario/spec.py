@@ -38,11 +38,14 @@ VariablePath = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*\..+$", exa
 StartValue = Annotated[
     Annotated[float, Tag("a number")] | Annotated[bool, Tag("true or false")], Discriminator(form)
 ]
+Row = Annotated[
+    Annotated[float, Tag("a number")] | Annotated[list[float], Tag("a list")], Discriminator(form)
+]
 AnyStart = Annotated[
     Annotated[float, Tag("a number")]
     | Annotated[bool, Tag("true or false")]
     | Annotated[str, Tag("text")]
-    | Annotated[list[float] | list[list[float]], Tag("a list")],
+    | Annotated[list[Row], Tag("a list")],
     Discriminator(form),
 ]
 

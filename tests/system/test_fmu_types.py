@@ -7,9 +7,11 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from fmu_helpers import Driver
 from reference_fmus import TYPES, feedthrough, reference, slave
+from test_reference_fmus import ball
 
 from exlinn_fmi.components.base import Status
 from exlinn_fmi.components.fmu import FmuComponent, FmuSettings, read_variables
@@ -17,8 +19,10 @@ from exlinn_fmi.components.texts import handle, text
 from exlinn_fmi.cosim.graph import Graph
 from exlinn_fmi.cosim.master import Master
 from exlinn_fmi.describe import describe
-from exlinn_fmi.errors import FmuError, InputError
+from exlinn_fmi.errors import FmuError, InputError, ScenarioError
+from exlinn_fmi.pipeline import simulate
 from exlinn_fmi.scenario.schema import FmuComponent as Spec
+from exlinn_fmi.workspace import Run
 
 
 @pytest.fixture
@@ -222,3 +226,68 @@ def test_a_state_goes_on_from_bytes_in_another_instance(tmp_path: Path, kind: st
             driver.run(10)
             ends.append(driver.get("h", "v"))
     assert ends[0] == ends[1]
+
+
+# ── through scenario files ───────────────────────────────────────────────────────────────────────────────
+
+SCENARIO = """
+name: types
+components:
+  ball: {fmu: ball/Model.fmu, interface: model_exchange, tolerance: 1e-9, isolate: ISOLATE}
+  all:
+    fmu: all/Model.fmu
+    isolate: ISOLATE
+    start: {m: 1, n: 3, r: 1, x0: [1, 2, 3], C: [[1, 2, 4]], u: [0], String_in: text, Binary_in: 0aff}
+connections:
+  ball.h: "all.u[1]"
+simulate: {stop: 1, step: 0.1}
+"""
+
+
+@pytest.mark.parametrize("isolate", ["false", "true"])
+def test_a_scenario_sizes_arrays_gives_texts_and_asks_for_model_exchange(
+    tmp_path: Path, isolate: str
+) -> None:
+    for name, make in (("ball", lambda f: reference(f, "BouncingBall", 2)), ("all", feedthrough)):
+        (tmp_path / name).mkdir()
+        make(tmp_path / name)
+    file = tmp_path / "s.yaml"
+    file.write_text(SCENARIO.replace("ISOLATE", isolate))
+    work = Run.open(file, tmp_path / "run")
+    simulate(work)
+    frame = pd.read_csv(work.folder / "trajectories.csv")
+    assert frame["ball.h"].to_numpy() == pytest.approx([ball(0.1 * k)[0] for k in range(11)], abs=1e-7)
+    assert frame["all.u[1]"].equals(frame["ball.h"])
+    assert frame["all.y[1]"].iloc[0] == 1 * 1 + 2 * 2 + 4 * 3
+    assert not [name for name in frame if "String" in name]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("String_in: text", "String_in: 3", "expected text, found 3"),
+        ("u: [0]", "u: [a]", r"start\.u.*expected a number.*found text 'a'"),
+        ("x0: [1, 2, 3]", "x0: [1, 2, 3, 4]", r"no variable 'x0\[4\]'"),
+        ('"all.u[1]"', "all.String_in", "type mismatch"),
+        ("m: 1", "m: 1.5", "expected a whole number"),
+        ("interface: model_exchange", "interface: model", "co_simulation"),
+    ],
+)
+def test_what_does_not_fit_in_a_scenario_is_told(tmp_path: Path, old: str, new: str, message: str) -> None:
+    for name, make in (("ball", lambda f: reference(f, "BouncingBall", 2)), ("all", feedthrough)):
+        (tmp_path / name).mkdir()
+        make(tmp_path / name)
+    file = tmp_path / "s.yaml"
+    file.write_text(SCENARIO.replace("ISOLATE", "false").replace(old, new))
+    with pytest.raises(ScenarioError, match=message):
+        Run.open(file, tmp_path / "run")
+
+
+def test_a_model_that_chatters_is_told(tmp_path: Path) -> None:
+    path = reference(tmp_path, "Switch", 2)
+    with closing(FmuComponent("it", path, FmuSettings("model_exchange"))) as component:
+        driver = Driver(component).begin(h=0.5, stop=2.0, band=0.0)
+        while (status := driver.step()) == Status.OK and driver.ticks < 4:
+            pass
+    assert status == Status.ERROR
+    assert "the model chatters" in component.message or "makes no progress" in component.message
