@@ -152,7 +152,9 @@ class Problem:
         """What can be told of the parameters with that information."""
         value = self.system.parameter_values
         scaled = information * np.outer(value, value)
-        size = np.sqrt(np.maximum(np.diag(scaled), np.finfo(float).tiny))
+        diagonal = np.diag(scaled)
+        # Where next to nothing is told, cancellation may leave less than nothing.
+        size = np.sqrt(np.where(diagonal > np.finfo(float).tiny, diagonal, np.inf))
         values, vectors = np.linalg.eigh(scaled / size[:, None] / size)
         seen = values > UNSEEN * max(values.max(), np.finfo(float).tiny)
         variance = ((vectors[:, seen] / size[:, None]) ** 2 / values[seen]).sum(axis=1)

@@ -221,3 +221,18 @@ def test_a_proposal_that_breaks_a_limit_at_a_close_look_is_made_smaller() -> Non
     assert isinstance(signal, Multisine)
     assert 0 < signal.rms < 6
     assert at.excess(*at.simulate([kept]))[0] == 0
+
+
+def test_information_that_cancels_to_less_than_nothing_tells_nothing() -> None:
+    at = problem()
+    matrix = information_of(at, [PAPER])
+    matrix[0] = matrix[:, 0] = 0
+    matrix[0, 0] = -1e-3
+    found = at.judge(matrix)
+    assert np.isinf(found.deviation[0])
+    assert np.isfinite(found.deviation[1:]).all()
+
+
+def test_a_candidate_whose_sensitivities_overflow_is_hopeless(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Problem, "information", lambda self, x, u: np.full((len(x), 6, 6), np.inf))
+    assert improve(problem(), PAPER, 10, 0) is None
