@@ -214,7 +214,7 @@ def _remove(folder: Path, lock: int) -> None:
 
 # ── locks ────────────────────────────────────────────────────────────────────────────────────────────────
 
-if sys.platform == "win32":  # files of a loaded library cannot be moved there, which does for a lock
+if sys.platform == "win32":  # pragma: no cover - files of a loaded library cannot be moved there: a lock
 
     def _lock(folder: Path, exclusive: bool = False) -> int | None:
         return 0 if folder.is_dir() else None

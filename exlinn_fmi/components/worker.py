@@ -228,7 +228,7 @@ def plain(content: str | bytes) -> tuple[str, bool]:
     return (content.hex(), True) if isinstance(content, bytes) else (content, False)
 
 
-def watch_parent(requests: int) -> None:
+def watch_parent(requests: int) -> None:  # pragma: no cover - in a process of its own
     """End this process as soon as the parent is gone, also in the middle of an endless loop."""
     if sys.platform == "win32":
         kernel = ctypes.windll.kernel32
@@ -250,13 +250,13 @@ def watch_parent(requests: int) -> None:
     _die_with_starter(0)
 
 
-def _die_with_starter(signal: int) -> None:
+def _die_with_starter(signal: int) -> None:  # pragma: no cover - in a process of its own
     """Linux: have the kernel send a signal when the thread that started this process ends; 0 for none."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal)  # PR_SET_PDEATHSIG
 
 
-def _limit(memory: int) -> None:
+def _limit(memory: int) -> None:  # pragma: no cover - in a process of its own
     """Bound what this process may take beyond what it has [bytes]; let crashes write no core files."""
     if sys.platform != "win32":
         import resource
@@ -268,7 +268,7 @@ def _limit(memory: int) -> None:
             resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
 
 
-def main(place: str, size: int, memory: int) -> None:
+def main(place: str, size: int, memory: int) -> None:  # pragma: no cover - in a process of its own
     """Serve a component over standard input and output, which from now on nobody else has.
 
     Args:
