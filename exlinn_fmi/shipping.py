@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from exlinn_fmi.data.files import write_bytes
 from exlinn_fmi.errors import InputError, nearest
-from exlinn_fmi.factory import build
+from exlinn_fmi.factory import build, inspect
 from exlinn_fmi.scenario.load import load_scenario, saved_scenario
 from exlinn_fmi.scenario.schema import NmpcComponent
 
@@ -134,7 +134,7 @@ def ship_loop(origin: Origin, path: Path, options: Options) -> Path:
     """
     from exlinn_fmi.export.build import export_model
     from exlinn_fmi.export.controller import controller_model
-    from exlinn_fmi.export.structure import Part, structure
+    from exlinn_fmi.export.ssp import write_ssp
 
     if path.suffix not in (".fmu", ".ssp"):
         raise InputError(f"{path}: a loop is an .fmu or an .ssp; give a file name that ends so")
@@ -147,12 +147,20 @@ def ship_loop(origin: Origin, path: Path, options: Options) -> Path:
         "controller": controller_model(controller, nmpc, origin.folder, "Controller", text),
         "model": origin.model(system),
     }
-    with tempfile.TemporaryDirectory(prefix="exlinn-export-") as folder:
-        parts = {
-            name: Part(model, export_model(model, Path(folder) / f"{name}.fmu", options).read_bytes())
-            for name, model in models.items()
+    wires = {f"model.{name}": f"controller.{name}" for name in system.state_names}
+    wires |= {f"controller.{name}": f"model.{name}" for name in system.input_names}
+    with tempfile.TemporaryDirectory(prefix="exlinn-export-") as name:
+        folder = Path(name)
+        for part, model in models.items():
+            export_model(model, folder / f"{part}.fmu", options)
+        loop = {
+            "name": path.stem,
+            "description": text,
+            "components": {part: {"fmu": f"{part}.fmu"} for part in models},
+            "connections": wires,
+            "simulate": {"stop": 10, "step": controller.parts.step},
         }
-    wires = [(f"model.{name}", f"controller.{name}") for name in system.state_names]
-    wires += [(f"controller.{name}", f"model.{name}") for name in system.input_names]
-    write_bytes(path, structure(path.stem, parts, wires))
-    return path
+        (folder / "scenario.yaml").write_text(json.dumps(loop), "utf-8")  # JSON is YAML too
+        loaded = load_scenario(folder / "scenario.yaml")
+        specs = loaded.scenario.components
+        return write_ssp(loaded, {part: inspect(spec, folder) for part, spec in specs.items()}, path)

@@ -5,13 +5,14 @@ An FMU has C inside and no Python: Co-Simulation and Model Exchange in one, sour
 
 from __future__ import annotations
 
+import io
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from exlinn_fmi.data.files import write_bytes
 from exlinn_fmi.errors import InputError
-from exlinn_fmi.export.archive import pack
 from exlinn_fmi.export.card import Card
 from exlinn_fmi.export.contents import fmu_members
 from exlinn_fmi.export.model import Ranges, StateSpaceModel, expanded_model, plant_model, system_model
@@ -151,7 +152,7 @@ def export_model(
         library = f"{model.identifier}{suffix(next(iter(parts)))}"
         members[f"binaries/{folder}/{library}"] = universal(parts)
     file = path / f"{model.identifier}.fmu" if path.is_dir() else path
-    write_bytes(file, pack(members))
+    write_bytes(file, _pack(members))
     return file
 
 
@@ -162,3 +163,16 @@ def _folders(libraries: Mapping[str, bytes], fmi: Version) -> dict[str, dict[str
         folder = PLATFORMS[name].folder if fmi == 2 and name in PLATFORMS else name
         found.setdefault(folder, {})[name] = library
     return found
+
+
+def _pack(members: Mapping[str, bytes]) -> bytes:
+    """A zip file of sorted members with a fixed date, so that it depends on their contents alone."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in sorted(members):
+            info = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
+            info.compress_type = zipfile.ZIP_DEFLATED
+            info.create_system = 3  # Unix, wherever it is packed
+            info.external_attr = (0o755 if name.startswith("binaries/") else 0o644) << 16
+            archive.writestr(info, members[name])
+    return stream.getvalue()

@@ -216,11 +216,12 @@ def test_a_loop_as_a_structure_names_its_parts_and_wires(run: Path, tmp_path: Pa
     with zipfile.ZipFile(path) as archive:
         assert set(archive.namelist()) == {
             "SystemStructure.ssd",
-            "resources/Controller.fmu",
-            "resources/Model.fmu",
+            "resources/controller.fmu",
+            "resources/model.fmu",
         }
         root = ET.fromstring(archive.read("SystemStructure.ssd"))
-    wires = {tuple(e.attrib.values()) for e in root.iter() if e.tag.endswith("}Connection")}
+    ends = ("startElement", "startConnector", "endElement", "endConnector")
+    wires = {tuple(e.get(end) for end in ends) for e in root.iter() if e.tag.endswith("}Connection")}
     assert ("controller", "v", "model", "v") in wires
     assert ("model", "alpha_dot", "controller", "alpha_dot") in wires
     result = simulate_ssp(str(path), stop_time=0.2, step_size=STEP)

@@ -12,9 +12,10 @@ import pytest
 from export_helpers import instance
 
 from exlinn_fmi import export
-from exlinn_fmi.errors import RunError, StorageError
-from exlinn_fmi.export import export_plant, export_system
+from exlinn_fmi.errors import FmuError, InputError, RunError, StorageError
+from exlinn_fmi.export import export_plant, export_system, platforms
 from exlinn_fmi.export.build import Options
+from exlinn_fmi.export.check import check_fmu
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.learned import ModelSpec, Scales, learned_system
@@ -93,3 +94,59 @@ def test_a_path_that_cannot_be_written_is_a_storage_error(tmp_path: Path) -> Non
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="could not be written"):
         export_plant(PLANT, tmp_path / "file" / "x.fmu")
+
+
+def test_a_platform_that_is_not_known_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="unknown platform 'sparc-solaris'; expected one of x86_64-linux"):
+        export_plant(PLANT, tmp_path, Options(platforms=("sparc-solaris",)))
+
+
+def test_without_a_compiler_for_all_platforms_this_machines_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(platforms, "has_zig", lambda: False)
+    assert platforms.buildable() == (platforms.host(),)
+    other = next(name for name in platforms.PLATFORMS if name != platforms.host())
+    with pytest.raises(InputError, match=f"no compiler for {other} here"):
+        export_plant(PLANT, tmp_path, Options(platforms=(other,)))
+
+
+def test_other_platforms_are_built_from_here(tmp_path: Path) -> None:
+    pytest.importorskip("ziglang")
+    names = ("x86_64-windows", "x86_64-darwin", "aarch64-darwin")
+    path = export_system(PENDULUM, tmp_path, name="P", options=Options(platforms=names))
+    with zipfile.ZipFile(path) as archive:
+        windows, mac = (archive.read(f"binaries/{n}") for n in ("win64/P.dll", "darwin64/P.dylib"))
+    assert windows[:2] == b"MZ"
+    assert b"ucrtbase.dll" in windows
+    assert mac[:8] == bytes.fromhex("cafebabe00000002")  # both processors in one library
+    again = export_system(PENDULUM, tmp_path / "again.fmu", name="P", options=Options(platforms=names))
+    assert again.read_bytes() == path.read_bytes()
+
+
+def test_the_check_names_what_is_wrong(tmp_path: Path) -> None:
+    path = export_system(PENDULUM, tmp_path, name="P", start={"theta": 1.0})
+    assert check_fmu(path).problems == ()
+    broken = tmp_path / "broken.fmu"
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(broken, "w") as new:
+        for name in old.namelist():
+            if name != "documentation/index.html":
+                new.writestr(name, old.read(name))
+    assert check_fmu(broken).problems == ("documentation/index.html is missing",)
+    with pytest.raises(FmuError, match="cannot be read as an FMU"):
+        check_fmu(Path(__file__))
+
+
+def test_the_check_finds_a_model_that_moves_otherwise(tmp_path: Path) -> None:
+    right = export_system(PENDULUM, tmp_path / "r.fmu", name="P", start={"theta": 1.0})
+    wrong = tmp_path / "w.fmu"
+    with zipfile.ZipFile(right) as old, zipfile.ZipFile(wrong, "w") as new:
+        for name in old.namelist():
+            content = old.read(name)
+            if name.endswith("reference_out.csv"):
+                lines = content.splitlines()
+                content = b"\n".join([*lines[:-1], lines[-1].replace(b".", b".1", 1)])
+            new.writestr(name, content)
+    problems = check_fmu(wrong).problems
+    assert len(problems) == 2
+    assert "differs from the reference" in problems[0]
