@@ -113,7 +113,8 @@ def description_2(model: Model) -> str:
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <fmiModelDescription fmiVersion="2.0" modelName="Model" guid="g" numberOfEventIndicators="{model.indicators}">
 <ModelExchange modelIdentifier="Model" {state} {directional}/>
-<CoSimulation modelIdentifier="Model" canHandleVariableCommunicationStepSize="true" {state} {directional}/>
+<CoSimulation modelIdentifier="Model" canHandleVariableCommunicationStepSize="true"
+  canInterpolateInputs="true" {state} {directional}/>
 <LogCategories><Category name="logStatusError"/></LogCategories>
 <ModelVariables>{"".join(lines)}</ModelVariables>
 <ModelStructure><Outputs>{"".join(f'<Unknown index="{k}" dependencies=""/>' for k in outputs)}</Outputs>

@@ -344,7 +344,7 @@ def _with_dependencies(version: int, model: Any, parts: Sequence[_Part]) -> Iter
         depends[_key(version, unknown.variable)] = None if names is None else tuple(names)
     for variable, key, place, size in parts:
         if variable.causality == "output":
-            variable = Variable(**{**variable.__dict__, "depends_on": depends.get(key)})
+            variable = replace(variable, depends_on=depends.get(key))
         yield variable, key, place, size
 
 

@@ -10,6 +10,7 @@ typedef struct {
     Values v;
     Mode mode;
     bool exchange, ended;
+    double slope[10];  /* of inputs, over the next step */
     const fmi2CallbackFunctions* calls;
     char folder[4096];
 } Fmu;
@@ -214,8 +215,18 @@ EXPORT fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolea
     int steps = (int)round(h / 0.01);
     for (int k = 0; k < (steps ? steps : 1); k++) {
         euler(&f->v, h / (steps ? steps : 1));
+        for (int i = 0; i < 10; i++) f->v.r[i] += f->slope[i] * h / (steps ? steps : 1);
         event(&f->v);
         if (f->v.terminate) { f->ended = true; return fmi2Discard; }
+    }
+    memset(f->slope, 0, sizeof f->slope);
+    return fmi2OK;
+}
+EXPORT fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n,
+                                              const fmi2Integer order[], const fmi2Real values[]) {
+    for (size_t k = 0; k < n; k++) {
+        ALLOW(order[k] == 1, "SetRealInputDerivatives");
+        ((Fmu*)c)->slope[vr[k]] = values[k];
     }
     return fmi2OK;
 }

@@ -240,6 +240,19 @@ def test_a_discrete_input_is_set_in_event_mode_in_co_simulation(opened) -> None:
     driver.run(1)
 
 
+def test_input_derivatives_reach_a_co_simulation_fmu_for_one_step(opened) -> None:
+    driver = opened("Switch", 2, "co_simulation").begin(h=0.1, stop=5.0, set=100.0)
+    assert driver.component.takes_input_derivatives
+    driver.component.set_input_derivatives(driver.component.indices("input")[:1], np.array([20.0]))
+    x = load = 0.0
+    for k in range(20):
+        x += 0.01 * (3.0 + load - x)
+        load += 0.01 * (20.0 if k < 10 else 0.0)
+    driver.run(2)
+    assert driver.get("x", "load") == pytest.approx([x, load], rel=1e-12)
+    assert not opened("Switch", 3, "co_simulation").component.takes_input_derivatives
+
+
 def test_an_event_after_a_step_is_heeded_and_so_is_the_wish_to_end(opened) -> None:
     driver = opened("Switch", 2, "model_exchange").begin(h=0.1, stop=20.0, set=200.0)
     driver.set(load=100.0)
