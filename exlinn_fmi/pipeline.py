@@ -177,9 +177,12 @@ def simulate(work: Run, resume: bool = False) -> None:
 
     began = time.perf_counter()
     components = {name: work.component(name) for name in scenario.components}
+    facts: dict[str, str] = {}
+    several = sum(bool(component.facts) for component in components.values()) > 1
     for name, component in components.items():
-        for note in component.notes:
-            work.reporter.note(f"{name}: {note}")
+        for key, fact in component.facts.items():
+            work.reporter.note(f"{name}: {key.replace('_', ' ')}: {fact}")
+            facts[f"control.{name}.{key}" if several else f"control.{key}"] = fact
         for warning in component.warnings:
             work.warn(f"{name}: {warning}")
     if scenario.events:
@@ -204,7 +207,7 @@ def simulate(work: Run, resume: bool = False) -> None:
     taken = told.get("component_seconds", {}).items()
     statistics |= {f"simulate.component_seconds.{name}": seconds for name, seconds in taken}
     judged = control_metrics(result.frame, scenario, result.units)
-    work.replace_metrics(("control.", "simulate."), judged | statistics)
+    work.replace_metrics(("control.", "simulate."), judged | facts | statistics)
     for name, said in told["warnings"].items():
         work.warn(f"{name}: {said['count']} warnings, the first: {said['first']}")
     if result.error is not None:

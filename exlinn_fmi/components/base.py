@@ -17,6 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -99,14 +100,14 @@ class Component(ABC):
         name: name in the scenario.
         variables: all variables; an index into this tuple addresses one.
         message: what the component last said of a status other than OK.
-        notes: what is worth a line in the log, e.g. a choice that was made for the user.
+        facts: what was decided for the user, by name: said in the log, and a metric of control.
         warnings: what the user should know before a run, e.g. of settings that do not fit together.
     """
 
     name: str
     variables: tuple[Variable, ...]
     message: str = ""
-    notes: Sequence[str] = ()
+    facts: Mapping[str, str] = MappingProxyType({})
     warnings: Sequence[str] = ()
 
     @property

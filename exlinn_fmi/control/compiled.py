@@ -9,6 +9,8 @@ model is brought to C by CasADi, compiled once for all, and called by the kernel
 from __future__ import annotations
 
 import ctypes
+import sys
+from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
@@ -18,21 +20,21 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.control.ocp import BACK_OFF, Ocp
 from exlinn_fmi.control.pack import pack_networks
-from exlinn_fmi.errors import InputError
+from exlinn_fmi.errors import InputError, RunError
 from exlinn_fmi.toolchain import cached_library
 
 FLAGS = (
     "-std=c99",
     "-O3",
-    "-march=native",
     "-ffp-contract=fast",
     "-fno-math-errno",
     "-fno-trapping-math",
-    "-fvisibility=hidden",
     "-Wno-psabi",
-    '-DNMPC_API=__attribute__((visibility("default")))',
 )
 """Fused multiply-add is more exact than what it stands for, and nothing here is compared bit by bit."""
+
+EXPORT = "__declspec(dllexport)" if sys.platform == "win32" else '__attribute__((visibility("default")))'
+"""What makes a function of the kernel one that Python finds."""
 
 INTEGERS = frozenset({"softened", "on", "slew", "state"})
 """Arrays of the kernel that hold integers."""
@@ -103,7 +105,7 @@ class Kernel:
             raise InputError(
                 f"the compiled solver has room for {MOST_STATES} states and {MOST_INPUTS} inputs"
             )
-        self._library = ctypes.CDLL(str(cached_library(kernel_sources(), "nmpc.c", FLAGS)))
+        self._library = _load(kernel_sources(), "nmpc.c", "-fvisibility=hidden", f"-DNMPC_API={EXPORT}")
         self._library.nmpc_size.restype = ctypes.c_size_t
         self._library.nmpc_array.restype = ctypes.c_void_p
         self.packed = pack_networks(ocp.system)
@@ -202,6 +204,15 @@ class Kernel:
         self._library.nmpc_program(*self._call)
 
 
+def _load(sources: Mapping[str, bytes], main: str, *more: str) -> ctypes.CDLL:
+    """A library for this processor, or where the compiler does not know how to ask for that, for any."""
+    try:
+        file = cached_library(sources, main, (*FLAGS, "-march=native", *more))
+    except RunError:
+        file = cached_library(sources, main, (*FLAGS, *more))
+    return ctypes.CDLL(str(file))
+
+
 def _model(
     ocp: Ocp, packed: tuple[NDArray[np.int64], NDArray[np.float64]] | None
 ) -> tuple[_Model, list[object]]:
@@ -214,8 +225,7 @@ def _model(
         raise InputError(f"the model is too long to be compiled ({function.n_instructions()} instructions)")
     generator = ca.CodeGenerator("model.c", {"with_header": False, "casadi_int": "long long int"})
     generator.add(function)
-    flags = (*(flag for flag in FLAGS if "NMPC" not in flag), "-fvisibility=default")
-    library = ctypes.CDLL(str(cached_library({"model.c": generator.dump().encode()}, "model.c", flags)))
+    library = _load({"model.c": generator.dump().encode()}, "model.c")
     entry = ctypes.cast(getattr(library, function.name()), ctypes.c_void_p).value
     made = _Model(
         function=entry,

@@ -159,7 +159,7 @@ class NmpcController(Component):
         self._memory = _Memory()
         self._following: _Memory | None = None
         self.warnings = diagnose(self._ocp, self._generator, first, self._estimator)
-        self.notes = (f"solver backend: {self._solver.backend}",)
+        self.facts = {"solver_backend": self._solver.backend}
         if self._solver.reason:
             self.warnings += (f"the solver is not compiled, and far slower: {self._solver.reason}",)
 

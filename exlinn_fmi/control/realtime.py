@@ -6,9 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from exlinn_fmi.control.compiled import Kernel
+from exlinn_fmi.control.gauss_newton import GaussNewton
 from exlinn_fmi.control.ocp import Targets
 from exlinn_fmi.control.reference import References
-from exlinn_fmi.control.solver import GaussNewton, Plan, Solution, Solver, SolveStatus, Stats
+from exlinn_fmi.control.solver import Plan, Solution, Solver, SolveStatus, Stats
 
 REASONS = (
     "",

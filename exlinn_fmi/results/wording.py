@@ -49,6 +49,7 @@ WORDING = (
     (r"control\.fallbacks", "Steps that fell back to the previous plan", ""),
     (r"control\.iterations_mean", "Solver iterations a step, mean", ""),
     (r"control\.cost_mean", "Cost J, mean", ""),
+    (r"control\.solver_backend", "What computed the solver's steps", ""),
     (r"study\.runs", "Runs", ""),
     (r"study\.success_rate", "Share of successes", ""),
     (r"study\.success_rate_low", "… at least (95 %)", ""),

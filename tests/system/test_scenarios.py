@@ -45,6 +45,7 @@ def test_main_job_tracks_within_bounds(tracking: Path) -> None:
     assert metrics["control.rmse_x_m"] <= 1e-3
     assert metrics["control.violations"] == 0
     assert metrics["control.fallbacks"] == 0
+    assert metrics["control.solver_backend"] == "compiled"
 
 
 def test_main_job_leaves_all_its_files(tracking: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import shutil
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from control_helpers import (
     generator,
     levitation,
     motor_cart,
+    oscillator,
     problem,
 )
 from hypothesis import given, settings
@@ -473,7 +475,7 @@ def test_without_a_compiler_casadi_takes_over_and_the_controller_says_so(monkeyp
 
     monkeypatch.setattr(compiled, "cached_library", none)
     silent = controller()
-    assert silent.notes == ("solver backend: casadi",)
+    assert silent.facts == {"solver_backend": "casadi"}
     assert any("no C compiler found" in warning for warning in silent.warnings)
     asked = controller(backend="casadi")
     assert not any("compile" in warning for warning in asked.warnings)
@@ -481,8 +483,33 @@ def test_without_a_compiler_casadi_takes_over_and_the_controller_says_so(monkeyp
         controller(backend="compiled")
 
 
+def test_a_compiler_that_knows_no_native_processor_compiles_for_any(monkeypatch):
+    inner, asked = compiled.cached_library, []
+
+    def old(sources, main, flags):
+        asked.append("-march=native" in flags)
+        if asked[-1]:
+            raise RunError("unknown argument: -march=native")
+        return inner(sources, main, flags)
+
+    monkeypatch.setattr(compiled, "cached_library", old)
+    solver, references = problem(oscillator(), "sqp", reference=constant("x", 0.0))
+    assert solver.backend == "compiled"
+    assert asked == [True, False, True, False]
+    assert (
+        solver.solve(np.array([0.1, 0.0]), references.over(0.0, np.zeros(2), (0,))).status
+        == SolveStatus.SOLVED
+    )
+
+
+def test_nothing_in_the_kernel_can_allocate():
+    """It has no other C library than that of numbers and of copying."""
+    sources = b"".join(kernel_sources().values()).decode()
+    assert set(re.findall(r"#include <(.*)>", sources)) == {"math.h", "stddef.h", "string.h"}
+
+
 def test_the_controller_says_that_it_is_compiled():
-    assert controller().notes == ("solver backend: compiled",)
+    assert controller().facts == {"solver_backend": "compiled"}
 
 
 def test_ipopt_is_never_compiled():

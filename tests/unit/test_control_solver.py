@@ -9,8 +9,9 @@ from control_helpers import CART, LIMITS, constant, motor_cart, oscillator, prob
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from exlinn_fmi.control.gauss_newton import GaussNewton
 from exlinn_fmi.control.qp import QpSolution, QpSolver, StageQp
-from exlinn_fmi.control.solver import GaussNewton, Plan, Solution, SolveStatus
+from exlinn_fmi.control.solver import Plan, Solution, SolveStatus
 from exlinn_fmi.errors import SolverError
 from exlinn_fmi.mechanics.coordinates import Coordinate
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, evaluate

@@ -60,19 +60,12 @@ static inline vec expm1_of(vec y) {
     vec shifted = y * 1.4426950408889634074 + ROUNDER;
     vec k = shifted - ROUNDER;
     vec r = y - k * 6.93147180369123816490e-01 - k * 1.90821492927058770002e-10;
-    vec p = all(1.0 / 6227020800.0);
-    p = p * r + 1.0 / 479001600.0;
-    p = p * r + 1.0 / 39916800.0;
-    p = p * r + 1.0 / 3628800.0;
-    p = p * r + 1.0 / 362880.0;
-    p = p * r + 1.0 / 40320.0;
-    p = p * r + 1.0 / 5040.0;
-    p = p * r + 1.0 / 720.0;
-    p = p * r + 1.0 / 120.0;
-    p = p * r + 1.0 / 24.0;
-    p = p * r + 1.0 / 6.0;
-    p = p * r + 0.5;
-    p = p * r * r + r;
+    /* Σ r^k / k!, k = 2 … 13, over r², by halves: a third of the delay of Horner's rule. */
+    vec r2 = r * r, r4 = r2 * r2;
+    vec a = (0.5 + r * (1.0 / 6.0)) + r2 * (1.0 / 24.0 + r * (1.0 / 120.0));
+    vec b = (1.0 / 720.0 + r * (1.0 / 5040.0)) + r2 * (1.0 / 40320.0 + r * (1.0 / 362880.0));
+    vec c = (1.0 / 3628800.0 + r * (1.0 / 39916800.0)) + r2 * (1.0 / 479001600.0 + r * (1.0 / 6227020800.0));
+    vec p = (a + r4 * (b + r4 * c)) * r2 + r;
     vec power = number((bits(shifted) << 52) + (1023LL << 52));
     return power * p + (power - 1.0);
 }
