@@ -144,6 +144,7 @@ def control_chart(trajectories: Table, loop: Loop, several: bool) -> Chart | Non
         *(_input_panel(trajectories, loop, name, path) for name, path in loop.inputs.items()),
         *outputs,
         *states,
+        *_estimated_panels(trajectories, loop, rows),
         _solve_time_panel(trajectories, loop, rows),
     ]
     shown = tuple(panel for panel in panels if panel is not None)
@@ -257,6 +258,28 @@ def _tracked_panel(
     )
     # What happens between the samples is drawn too, the error is only known at them.
     return replace(sampled, lines=(Line("measured", time, line.y), *sampled.lines[1:]))
+
+
+def _estimated_panels(table: Table, loop: Loop, rows: NDArray[np.bool_]) -> list[Panel]:
+    """What the controller estimates: states that it does not measure, and disturbances if there are any."""
+    frame, panels = table.frame, list[Panel]()
+    if not rows.any():
+        return panels
+    time = _values(frame, "time")[rows]
+    for column in map(str, frame.columns):
+        owner, _, name = column.partition(".")
+        kind, _, of = name.partition("_")
+        if owner != loop.controller or kind not in ("estimate", "disturbance") or of in loop.states:
+            continue
+        values = _values(frame, column)[rows]
+        lines: tuple[Line, ...] = (Line("estimated", time, values, held=True),)
+        if kind == "estimate" and loop.reference_of(of) in frame.columns:
+            reference = _values(frame, loop.reference_of(of))[rows]
+            lines += (Line("reference", time, reference, "reference"),)
+        if kind == "estimate" or np.nanmax(np.abs(values), initial=0.0) > 0.0:
+            title = f"{of} (estimated)" if kind == "estimate" else f"disturbance of {of}"
+            panels.append(Panel(title, table.unit(column), lines))
+    return panels
 
 
 def _input_panel(table: Table, loop: Loop, name: str, path: str) -> Panel | None:
