@@ -138,6 +138,20 @@ def test_control_shows_cost_input_output_states_and_effort(tmp_path: Path) -> No
     assert panels["v"].lines[0].held
 
 
+def test_control_shows_what_is_estimated_and_not_measured(tmp_path: Path) -> None:
+    frame = trajectories()
+    frame["controller.estimate_alpha"] = frame["plant.alpha"]
+    frame["controller.estimate_w"] = frame["controller.reference_w"] = frame["plant.alpha_dot"]
+    frame["controller.disturbance_alpha"] = 0.1
+    frame["controller.disturbance_Q"] = 0.0
+    panels = panels_of(make_run(tmp_path, control=True), frame)
+    assert [name for name in panels if "estimated" in name or "disturbance" in name] == [
+        "w (estimated)",
+        "disturbance of alpha",
+    ]
+    assert roles(panels["w (estimated)"]) == ["main", "reference"]
+
+
 def test_tracking_error_is_drawn_where_the_reference_is_fresh(tmp_path: Path) -> None:
     strip = panels_of(make_run(tmp_path, control=True))["x"].strip
     assert strip is not None
