@@ -269,7 +269,8 @@ def _estimated_panels(table: Table, loop: Loop, rows: NDArray[np.bool_]) -> list
     for column in map(str, frame.columns):
         owner, _, name = column.partition(".")
         kind, _, of = name.partition("_")
-        if owner != loop.controller or kind not in ("estimate", "disturbance") or of in loop.states:
+        wanted = kind == "disturbance" or (kind == "estimate" and of not in loop.states)
+        if owner != loop.controller or not wanted:
             continue
         values = _values(frame, column)[rows]
         lines: tuple[Line, ...] = (Line("estimated", time, values, held=True),)
