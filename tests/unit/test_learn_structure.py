@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from learn_helpers import multisine, simulate
+from scenario_helpers import SCENARIO, load
 
 from exlinn_fmi.data.dataset import Dataset, split
 from exlinn_fmi.learn.basis import entry, generic_basis
@@ -94,3 +95,13 @@ def test_an_offset_is_a_term_of_its_own_even_of_a_cyclic_coordinate() -> None:
     model = train(*split(motor(), 0.8, 8, 0), method, 0)
     assert model.weights["lagrangian.terms"] == pytest.approx([0.02, 0.02, 0.5, 0.7, 0], rel=1e-8)
     assert model.weights["dissipation.terms"] == pytest.approx([0.02, 0.02, 0.04, 1e-4, 1], rel=1e-7)
+
+
+def test_a_scenario_says_what_is_known_of_the_plant(tmp_path) -> None:
+    text = SCENARIO.replace("      topology: circle\n", "      topology: circle\n      friction: [coulomb]\n")
+    text = text.replace("      topology: cyclic\n", "      topology: cyclic\n      offset: true\n")
+    text = text.replace("learn:\n", "learn:\n  energies: {potential: false, coupling: magnetic}\n")
+    learn = load(tmp_path, text).scenario.learn
+    assert learn is not None
+    assert learn.structure == Structure(False, "magnetic", (("coulomb",), None), (False, True))
+    assert learn.coordinates[0].coordinate() == load(tmp_path).scenario.learn.coordinates[0].coordinate()
