@@ -13,7 +13,8 @@ from exlinn_fmi.learn.assembly import inverse_assembly
 from exlinn_fmi.learn.levenberg import levenberg_marquardt
 from exlinn_fmi.learn.networks import StructuredNetworks
 from exlinn_fmi.learn.objective import Inverse, Objective
-from exlinn_fmi.learn.structured import FLOOR, structured_spec
+from exlinn_fmi.learn.refine import FLOOR
+from exlinn_fmi.learn.structured import structured_spec
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.learned import learned_system
 from exlinn_fmi.scenario.learning import Structured

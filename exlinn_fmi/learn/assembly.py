@@ -131,6 +131,38 @@ def product_basis(
     return basis, slopes
 
 
+def product_curvature(
+    z: Float[Array, "B nz"], products: Sequence[tuple[int, ...]]
+) -> Float[Array, "B H nz nz"]:
+    """Second derivatives of [1, z, products of features] with respect to z."""
+    rows, nz = z.shape
+    curvature = np.zeros((rows, 1 + nz + len(products), nz, nz))
+    for k, product in enumerate(products, start=1 + nz):
+        for a, i in enumerate(product):
+            for b, j in enumerate(product):
+                if a != b:
+                    rest = [f for place, f in enumerate(product) if place not in (a, b)]
+                    curvature[:, k, i, j] += z[:, rest].prod(axis=1)
+    return curvature
+
+
+def topology_curvature(
+    spec: ModelSpec, q: Float[Array, "B n"]
+) -> tuple[Float[Array, "B nz"], Float[Array, "B nz"]]:
+    """First and second derivative of each network input with respect to its own coordinate."""
+    assert spec.scales is not None
+    z, slope = topology_features(spec, q)
+    bend = np.empty_like(z)
+    for k, i in enumerate(spec.layout.owners):
+        if spec.coordinates[i].topology == "circle":
+            bend[:, k] = -(angular(spec.coordinates[i]) ** 2) * z[:, k]
+        else:
+            place = (q[:, i] - spec.scales.centre[i]) / spec.scales.reach[i]
+            tanh = np.sign(place) * np.tanh(np.maximum(np.abs(place) - FAITHFUL, 0))
+            bend[:, k] = -2 * tanh * slope[:, k] / spec.scales.reach[i]
+    return slope, bend
+
+
 def _velocity_monomial(
     term: tuple[str, int, int], w: Array, a: Array
 ) -> tuple[Float[Array, " B"], Float[Array, "B n"], Float[Array, "B n"]]:

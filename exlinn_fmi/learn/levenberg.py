@@ -124,6 +124,7 @@ def levenberg_marquardt(
     linearise: Callable[[Vector], Linearised],
     value: Callable[[Vector], float],
     floor: float = 0.0,
+    alike: int | None = None,
 ) -> Iterator[Step]:
     """Descend from `theta`; ends where no step makes the objective smaller.
 
@@ -132,8 +133,9 @@ def levenberg_marquardt(
         linearise: the problem linearised at a point.
         value: the objective alone.
         floor: columns of J are damped as if they had at least this share of the largest one's square. Where
-            all entries of θ have one unit, this keeps those that hardly act yet from steps so long that
-            their own curvature undoes them.
+            entries of θ have one unit, this keeps those that hardly act yet from steps so long that their own
+            curvature undoes them.
+        alike: so many entries, the first ones, have that unit; all if not given.
 
     Yields:
         The start, then every accepted step.
@@ -146,7 +148,9 @@ def levenberg_marquardt(
     scale = at.sizes
     while damping < MOST_DAMPING and np.isfinite(at.sizes).all():
         scale = np.maximum(scale, at.sizes)
-        step = at.step(damping * np.maximum(scale + floor * scale.max(), np.finfo(float).tiny))
+        lifted = np.maximum(scale, np.finfo(float).tiny)
+        lifted[:alike] += floor * scale[:alike].max(initial=0.0)
+        step = at.step(damping * lifted)
         if step is None:
             damping, growth = damping * growth, 2 * growth
             continue

@@ -139,6 +139,47 @@ class StructuredNetworks:
                 f[:, t], df[:, t] = outputs[:, row], gradients[:, row]
         return f, df
 
+    def balance(
+        self, weights: dict[str, Array], data: Assembly
+    ) -> tuple[Float[Array, "B n"], Float[Array, "B n n"]]:
+        """The residual, and the mass matrix M."""
+        forward, layout = self._forward(weights, data), self.spec.layout
+        n = data.target.shape[1]
+        mass = np.zeros((len(data), n, n))
+        for kind, i, j in layout.terms:
+            if kind == "M":
+                left, right = forward.outputs[:, layout.rows[i]], forward.outputs[:, layout.rows[j]]
+                mass[:, i, j] = mass[:, j, i] = np.einsum("bc,bc->b", left, right)
+        mass[:, range(n), range(n)] += self.spec.epsilon
+        return forward.residual, mass
+
+    def outputs(
+        self, weights: dict[str, Array], data: Assembly, curvature: Float[Array, "B nd nz nz"]
+    ) -> tuple[Float[Array, "B O"], Float[Array, "B O nz"], Float[Array, "B O nz nz"]]:
+        """Outputs with first and second derivatives with respect to z.
+
+        Args:
+            weights: arrays by name.
+            data: the samples.
+            curvature: second derivatives of the direct path's functions.
+        """
+        basis, slopes = self.basis(weights, data)
+        out, w = weights["lagrangian.output"], weights["lagrangian.hidden.weight"]
+        start = self.spec.layout.basis - self.spec.layout.hidden
+        tanh = basis[:, start:]
+        bent = (-2 * tanh * (1 - tanh**2)) @ _outer(out[:, start:], w)
+        second = np.einsum("oh,bhjk->bojk", out[:, :start], curvature) + bent.reshape(
+            len(basis), len(out), *curvature.shape[2:]
+        )
+        return (*_outputs(weights, basis, slopes), second)
+
+    def friction_slope(self, weights: dict[str, Array], v: Float[Array, "B n"]) -> Float[Array, "B n"]:
+        """∂²D/∂q̇² of each velocity."""
+        slope = self._slip(v[:, :, None] / friction_width(weights))[1]
+        curvature = np.einsum("nk,bnk->bn", weights["dissipation.friction"] ** 2, slope)
+        drag = 2 * weights["dissipation.quadratic"] ** 2 * np.abs(v)
+        return np.asarray(curvature + weights["dissipation.viscous"] ** 2 + drag)
+
     # ── derivatives ──────────────────────────────────────────────────────────────────────────────────────
 
     def gradient(self, theta: Float[Array, " P"], data: Assembly) -> tuple[float, Float[Array, " P"]]:
@@ -276,6 +317,11 @@ def coupling_columns(layout: Layout, velocity: Float[Array, "B n"]) -> Float[Arr
         columns[:, i, k] = velocity[:, j]
         columns[:, j, k] = -velocity[:, i]
     return columns
+
+
+def _outer(out: Float[Array, "O h"], w: Float[Array, "h nz"]) -> Float[Array, "h k"]:
+    """Of each unit: its share in each output times the square of its slopes, k = O·nz·nz."""
+    return np.asarray(np.einsum("oh,hj,hk->hojk", out, w, w).reshape(len(w), len(out) * w.shape[1] ** 2))
 
 
 def _outputs(

@@ -4,6 +4,8 @@ Three stages: the direct path alone, which suffices for mechanisms whose Lagrang
 polynomial in the positions; then, if the target is not met, with the hidden units, from silent ones or from a
 linear start of their own, whichever is better; both on every k-th sample, since sampled
 motion repeats itself. The last stage takes all samples.
+
+Where states are noisy, or accelerations do not fit, what comes of it is refined on trajectories (`refine`).
 """
 
 from __future__ import annotations
@@ -20,20 +22,25 @@ from exlinn_fmi.learn.assembly import data_scales, inverse_assembly
 from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.learn.levenberg import levenberg_marquardt
 from exlinn_fmi.learn.networks import StructuredNetworks
+from exlinn_fmi.learn.noise import CLEAN, relative_noise
 from exlinn_fmi.learn.objective import Inverse, Objective, loss
+from exlinn_fmi.learn.refine import FLOOR, SWEEPS, Candidate, refine
 from exlinn_fmi.learn.start import Start, hidden_starts, linear_start
 from exlinn_fmi.mechanics.learned import ModelSpec
 from exlinn_fmi.mechanics.structure import UNKNOWN, Structure
+from exlinn_fmi.scenario.learning import Objective as Goal
 from exlinn_fmi.scenario.learning import Structured
 
 Array = NDArray[np.float64]
 
+MOST = 2 * sum(most for most, _ in SWEEPS)
+"""Most iterations on trajectories."""
+CONSISTENT = 1e-3
+"""Accelerations that leave no more than this share of the forces unexplained are as good as measured."""
 COARSE = 4000
 """About as many samples do the first stages look at."""
 PATIENCE = {"direct": (10, 0.5), "hidden": (20, 0.8), "all": (3, 0.5)}
 """A stage ends when that many iterations left more than that share of the loss."""
-FLOOR = 1e-2
-"""Weights are damped as if each had at least this share of the largest effect."""
 
 
 def structured_spec(
@@ -56,8 +63,18 @@ def structured_spec(
     return replace(spec, epsilon=start.epsilon), start
 
 
+def most_iterations(options: Structured, objective: Goal, train: Dataset) -> int:
+    """The most iterates there will be, as far as that is known beforehand."""
+    return options.iterations + MOST * (choose(objective, train)[0] == "trajectory")
+
+
 def iterate_structured(
-    spec: ModelSpec, start: Start, train: Dataset, validation: Dataset, options: Structured
+    spec: ModelSpec,
+    start: Start,
+    train: Dataset,
+    validation: Dataset,
+    options: Structured,
+    objective: Goal = "auto",
 ) -> Iterator[Iterate]:
     """Train; ends when the target is met or nothing more is gained.
 
@@ -67,11 +84,61 @@ def iterate_structured(
         train: data to fit.
         validation: data to watch.
         options: the learner's settings.
+        objective: what to make small.
 
     Yields:
         The start of each stage and every iteration.
     """
     networks = StructuredNetworks(spec)
+    best: dict[str, Iterate] = {}
+    notes = {"objective": choose(objective, train)[1], "noise": relative_noise(train)}
+    stages = _inverse(networks, start, train, validation, options)
+    for now, _ in zip(stages, range(options.iterations + 1), strict=False):
+        for stage in {now.stage, "any"}:
+            if stage not in best or now.rank < best[stage].rank:
+                best[stage] = now
+        yield replace(now, notes=notes)
+    chosen, notes["objective"] = choose(objective, train, best["any"].loss)
+    if chosen == "trajectory":
+        direct, full = (networks.pack(best[stage].weights) for stage in ("direct", "any"))
+        mask, every = networks.pack_mask(spec.layout.direct), np.ones(networks.size, dtype=bool)
+        if not full[~mask].any():  # units that were never asked begin as they were drawn
+            full = np.where(mask, full, networks.pack(start.weights))
+        candidates = (
+            Candidate("trajectory, direct", direct, mask),
+            Candidate("trajectory", full, every),
+        )
+        yield from refine(networks, candidates, train, validation, notes)
+
+
+def choose(objective: Goal, data: Dataset, loss: float = 0.0) -> tuple[Goal, str]:
+    """What to make small, and why.
+
+    Args:
+        objective: what the user chose; ``auto`` leaves it to the data.
+        data: what is fitted.
+        loss: share of the forces, squared, that the inverse model left unexplained.
+    """
+    if objective != "auto":
+        return objective, f"{objective}: as the scenario says"
+    noise = relative_noise(data)
+    worst = max(noise, key=lambda name: noise[name])
+    if noise[worst] > CLEAN:
+        why = f"{worst} has {100 * noise[worst]:.2g} % noise, the most of all states"
+        return "trajectory", f"trajectory: {why}"
+    if loss > CONSISTENT**2:
+        why = (
+            f"states are clean, but {100 * float(np.sqrt(loss)):.2g} % of forces do not fit the accelerations"
+        )
+        return "trajectory", f"trajectory: {why}"
+    return "inverse", "inverse: the states are clean and the accelerations do not contradict them"
+
+
+def _inverse(
+    networks: StructuredNetworks, start: Start, train: Dataset, validation: Dataset, options: Structured
+) -> Iterator[Iterate]:
+    """The three stages on the inverse model."""
+    spec = networks.spec
     data, held = (Inverse(networks, inverse_assembly(spec, part.arrays)) for part in (train, validation))
     coarse = Inverse(networks, data.data.part(slice(None, None, -(-len(data.data) // COARSE))))
     theta, chosen, met = networks.pack(start.weights), networks.pack_mask(spec.layout.direct), False

@@ -24,7 +24,7 @@ from exlinn_fmi.learn.discover import COARSE, Discovery, discover, eliminate, le
 from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.learn.noise import CLEAN, noise_levels, relative_noise
 from exlinn_fmi.learn.projection import Make, solve
-from exlinn_fmi.learn.trajectory import Fit, Information, Shooting, cut, even
+from exlinn_fmi.learn.trajectory import Fit, Information, Shooting, cut
 from exlinn_fmi.learn.weak import OVERLAP, Regression, inverse_regression, weak_regression
 from exlinn_fmi.mechanics.coordinates import Parameter, state_names
 from exlinn_fmi.mechanics.learned import ModelSpec
@@ -90,10 +90,6 @@ def choose(
         return objective, f"{objective}: as the scenario says"
     noise = relative_noise(data)
     worst = max(noise, key=lambda name: noise[name])
-    if not even(data):
-        if noise[worst] > CLEAN:
-            return "weak", f"weak: {worst} has {100 * noise[worst]:.2g} % noise, but steps differ in length"
-        return "inverse", "inverse: the states are clean and steps differ in length"
     if noise[worst] > CLEAN:
         return (
             "trajectory",

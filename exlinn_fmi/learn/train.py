@@ -160,10 +160,11 @@ def _learner(
 
         spec = terms_spec(train, method, structure)
         return spec, iterate_terms(spec, train, validation, objective, method), STAGES
-    from exlinn_fmi.learn.structured import iterate_structured, structured_spec
+    from exlinn_fmi.learn.structured import iterate_structured, most_iterations, structured_spec
 
     spec, start = structured_spec(train, method, seed, structure)
-    return spec, iterate_structured(spec, start, train, validation, method), method.iterations
+    iterates = iterate_structured(spec, start, train, validation, method, objective)
+    return spec, iterates, most_iterations(method, objective, train)
 
 
 def _ranges(train: Dataset) -> dict[str, tuple[float, float]]:

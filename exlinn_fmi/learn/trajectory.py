@@ -24,9 +24,11 @@ from scipy.linalg import block_diag
 from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.errors import DataError, TrainingError
 from exlinn_fmi.learn.levenberg import Normal, levenberg_marquardt
+from exlinn_fmi.learn.motion import NetworkMotion
+from exlinn_fmi.learn.networks import StructuredNetworks
 from exlinn_fmi.learn.noise import FLOOR, noise_levels
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
-from exlinn_fmi.mechanics.sensitivity import Propagator
+from exlinn_fmi.mechanics.sensitivity import Motion, Propagator
 
 Array = NDArray[np.float64]
 
@@ -34,10 +36,12 @@ SEGMENTS = 50
 """Segments of the longest trajectory, …"""
 SHORTEST, LONGEST = 10, 400
 """… which have so many steps at least and at most."""
-EVEN = 1e-3
-"""Sampling steps may differ by this share of their median."""
+BREAK = 20.0
+"""A step of more than so many usual ones is no step but a gap."""
 GAP = 1e-3
 """Gaps between segments are weighed as if they had this share of the noise."""
+BLOCK = 32
+"""Rows whose sensitivities are kept at once."""
 GAIN = 1e-6
 """Iterations that gain less than this share end the fit."""
 
@@ -51,7 +55,7 @@ class Segments:
         inputs: held from each row to the next.
         counted: 1 where a row counts, 0 where it is another segment's first or padding.
         follows: for each segment the one that continues it, −1 where none does.
-        step: from row to row [s].
+        steps: from row to row [s].
         sigma: noise of each state.
     """
 
@@ -59,7 +63,7 @@ class Segments:
     inputs: Float[Array, "B K m"]
     counted: Float[Array, "B rows"]
     follows: Int[NDArray[np.intp], " B"]
-    step: float
+    steps: Float[Array, "B K"]
     sigma: Float[Array, " nx"]
 
     @property
@@ -68,47 +72,45 @@ class Segments:
         return float(self.counted.sum())
 
 
-def even(data: Dataset) -> bool:
-    """Whether all steps have one length, as fits to trajectories need."""
-    steps = np.concatenate(
-        [np.diff(part["time"].to_numpy(dtype=float)) for _, part in data.frame.groupby("trajectory")]
-    )
-    return bool(np.abs(steps - np.median(steps)).max() <= EVEN * np.median(steps))
-
-
 def cut(data: Dataset, states: list[str], inputs: list[str], every: int = 1) -> Segments:
     """Cut a data set into segments.
 
     Args:
-        data: trajectories at one equal step.
+        data: trajectories; steps may differ.
         states: names of the states x.
         inputs: names of the inputs u.
         every: take every so many rows, under the mean of the inputs between them.
 
     Raises:
-        DataError: the steps differ.
+        DataError: a step is so long that nothing is known of what went on in it.
     """
     frames = [part for _, part in data.frame.groupby("trajectory", sort=False) if len(part) > every]
     steps = np.concatenate([np.diff(part["time"].to_numpy(dtype=float)) for part in frames])
-    step = float(np.median(steps))
-    if not even(data):
+    usual = float(np.median(steps))
+    if steps.max() > BREAK * usual:
         raise DataError(
-            f"data set: steps of {steps.min():.6g} s to {steps.max():.6g} s, expected one step throughout to "
-            "fit to trajectories; resample the data, or choose the objective 'inverse'"
+            f"data set: a step of {steps.max():.6g} s where {usual:.6g} s are usual; to fit to trajectories "
+            "give what comes after the gap a trajectory of its own, or choose the objective 'inverse'"
         )
     k = int(np.clip(max(map(len, frames)) // (SEGMENTS * every), SHORTEST, LONGEST))
-    measured, held, counted, follows = [], [], [], []
+    measured, held, counted, follows, lengths = [], [], [], [], []
     for part in frames:
         x = part[states].to_numpy(dtype=float)[::every]
+        time = part["time"].to_numpy(dtype=float)
         begins = np.arange(0, len(part), every)
-        widths = np.diff(np.append(begins, len(part)))[:, None]
-        u = np.add.reduceat(part[inputs].to_numpy(dtype=float), begins, axis=0) / widths
+        length = np.append(np.diff(time), usual)  # the last row's input acts on nothing that was measured
+        step = np.add.reduceat(length, begins)
+        u = (
+            np.add.reduceat(part[inputs].to_numpy(dtype=float) * length[:, None], begins, axis=0)
+            / step[:, None]
+        )
         for first in range(0, len(x) - 1, k):
             rows = np.arange(first, first + k + 1)
             at = np.minimum(rows, len(x) - 1)
             last = first + k >= len(x) - 1
             measured.append(x[at])
             held.append(u[at[:-1]])
+            lengths.append(step[at[:-1]])
             counted.append((rows < len(x)) & (last | (rows < first + k)))
             follows.append(-1 if last else len(measured))
     return Segments(
@@ -116,7 +118,7 @@ def cut(data: Dataset, states: list[str], inputs: list[str], every: int = 1) -> 
         np.array(held).reshape(len(held), k, len(inputs)),
         np.array(counted, dtype=float),
         np.array(follows),
-        step * every,
+        np.array(lengths),
         noise_levels(data),
     )
 
@@ -179,16 +181,20 @@ class Shooting:
     """The sum of squares as a function of θ = (p, first states of the segments).
 
     Args:
-        system: a family with parameters p.
+        system: a family with parameters p, or networks with weights p.
         data: trajectories, cut into segments.
+        prior: weight of the square of each parameter: what is known of weights before any data.
     """
 
-    system: LagrangianSystem
+    system: LagrangianSystem | StructuredNetworks
     data: Segments
+    prior: float | Float[Array, " P"] = 0.0
 
     @cached_property
-    def _propagator(self) -> Propagator:
-        return Propagator(self.system, self.data.step)
+    def _motion(self) -> Motion:
+        if isinstance(self.system, StructuredNetworks):
+            return NetworkMotion(self.system, self.data.steps)
+        return Propagator(self.system, self.data.steps)
 
     def start(self, p: Float[Array, " P"], states: Float[Array, "B nx"] | None = None) -> Float[Array, " T"]:
         """θ for parameters p, segments starting as measured if not said otherwise."""
@@ -196,13 +202,13 @@ class Shooting:
 
     def split(self, theta: Float[Array, " T"]) -> tuple[Float[Array, " P"], Float[Array, "B nx"]]:
         """Parameters and first states that θ holds."""
-        count = len(self.system.parameters)
+        count = self._motion.size
         return theta[:count], theta[count:].reshape(len(self.data.measured), -1)
 
     def predict(self, theta: Float[Array, " T"]) -> Float[Array, "B rows nx"]:
         """States at the rows."""
         p, states = self.split(theta)
-        return self._propagator.run(states, self.data.inputs, p)
+        return self._motion.run(states, self.data.inputs, p)
 
     def residuals(self, x: Float[Array, "B rows nx"]) -> Float[Array, "B rows nx"]:
         """Predicted less measured over σ; 0 where rows do not count."""
@@ -217,7 +223,9 @@ class Shooting:
         """The sum of squares; not finite where the model diverges."""
         with np.errstate(all="ignore"):
             x = self.predict(theta)
-            return float(np.sum(self.residuals(x) ** 2) + np.sum(self._gaps(x, self.split(theta)[1]) ** 2))
+            p, states = self.split(theta)
+            gaps = self._gaps(x, states)
+            return float(np.sum(self.residuals(x) ** 2) + np.sum(gaps**2) + np.sum(self.prior * p**2))
 
     def misprediction(self, p: Float[Array, " P"]) -> float:
         """Sum of squares of predictions from the segments' first states as measured."""
@@ -232,10 +240,15 @@ class Shooting:
         rest, gaps = self.residuals(x), self._gaps(x, states)
         local = np.zeros((count, nx + r, nx + r))
         slope = np.zeros((count, nx + r))
-        for k, s in enumerate(self._propagator.sensitivities(x, data.inputs, p)):
-            j = s / data.sigma[:, None] * data.counted[:, k, None, None]
-            local += j.transpose(0, 2, 1) @ j
-            slope += np.einsum("bxp,bx->bp", j, rest[:, k])
+        part: list[Array] = []
+        for k, s in enumerate(self._motion.sensitivities(x, data.inputs, p)):
+            part.append(s / data.sigma[:, None] * data.counted[:, k, None, None])
+            if len(part) == BLOCK or k == len(data.inputs[0]):
+                j = np.concatenate(part, axis=1)
+                r_part = rest[:, k + 1 - len(part) : k + 1].reshape(count, -1)
+                local += j.transpose(0, 2, 1) @ j
+                slope += np.einsum("bxp,bx->bp", j, r_part)
+                part = []
         joined = np.flatnonzero(data.follows >= 0)
         j = s[joined] / (GAP * data.sigma[:, None])
         local[joined] += j.transpose(0, 2, 1) @ j
@@ -253,11 +266,13 @@ class Shooting:
             matrix[after, after] += np.diag(other**2)
             gradient[after] -= other * gaps[b]
         matrix[:r, r:] = matrix[r:, :r].T
-        return Normal(float(np.sum(rest**2) + np.sum(gaps**2)), gradient, matrix)
+        matrix[range(r), range(r)] += self.prior
+        gradient[:r] += self.prior * p
+        return Normal(float(np.sum(rest**2) + np.sum(gaps**2) + np.sum(self.prior * p**2)), gradient, matrix)
 
     def information(self, theta: Float[Array, " T"]) -> Information:
         """What the data tell of p at θ."""
-        matrix, r = self.normal(theta).matrix, len(self.system.parameters)
+        matrix, r = self.normal(theta).matrix, self._motion.size
         try:
             cross = np.linalg.solve(matrix[r:, r:], matrix[r:, :r])
         except np.linalg.LinAlgError as error:
@@ -271,7 +286,7 @@ class Shooting:
         """Noise of each state as the residuals show it, less what the fit has taken of them."""
         rest = self.residuals(self.predict(theta))
         # Segments are joined, so that only a trajectory's first state is free.
-        free = len(self.system.parameters) / rest.shape[2] + float(np.sum(self.data.follows < 0))
+        free = self._motion.size / rest.shape[2] + float(np.sum(self.data.follows < 0))
         share = np.sqrt(np.sum(rest**2, axis=(0, 1)) / max(self.data.total - free, 1))
         size = np.abs(self.data.measured).max(axis=(0, 1))
         return np.asarray(np.maximum(self.data.sigma * share, FLOOR * np.where(size > 0, size, 1)))

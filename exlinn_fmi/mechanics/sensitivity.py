@@ -6,6 +6,7 @@ chained in numpy for all segments together, so that no Python loop runs over sam
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,22 +21,61 @@ from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, Symbol
 Array = NDArray[np.float64]
 
 
+class Motion(ABC):
+    """States along B segments of K steps each through recorded inputs, as they depend on r parameters p."""
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """Number of parameters."""
+
+    @abstractmethod
+    def run(
+        self, start: Float[Array, "B nx"], inputs: Float[Array, "B K m"], p: Float[Array, " r"]
+    ) -> Float[Array, "B rows nx"]:
+        """States at all rows; not finite from where a segment diverges.
+
+        Args:
+            start: first state of each segment.
+            inputs: held from each row to the next.
+            p: parameters.
+        """
+
+    @abstractmethod
+    def sensitivities(
+        self, states: Float[Array, "B rows nx"], inputs: Float[Array, "B K m"], p: Float[Array, " r"]
+    ) -> Iterator[Float[Array, "B nx columns"]]:
+        """Derivatives of the states by the segment's first state and by p, at each row from the first on.
+
+        Args:
+            states: what `run` gave.
+            inputs: held from each row to the next.
+            p: parameters.
+        """
+
+
 @dataclass(frozen=True)
-class Propagator:
-    """RK4 through recorded inputs, held from row to row, for B segments of K steps each.
+class Propagator(Motion):
+    """RK4 through recorded inputs, held from row to row.
 
     Args:
         system: with nx states, m inputs and r parameters.
-        step: from row to row [s].
+        step: from row to row [s], one for all or (B, K).
     """
 
     system: LagrangianSystem
-    step: float
+    step: float | Float[Array, "B K"]
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return len(self.system.parameters)
 
     @cached_property
     def _advance(self) -> ca.Function:
         x, u, p = self._symbols
-        return ca.Function("advance", [x, u, p], [self.system.rk4()(x, u, p, self.step)])
+        h = ca.SX.sym("h")
+        return ca.Function("advance", [x, u, p, h], [self.system.rk4()(x, u, p, h)])
 
     @cached_property
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
@@ -46,9 +86,9 @@ class Propagator:
 
     @cached_property
     def _derivatives(self) -> ca.Function:
-        """(x, u, p) → ∂x⁺/∂x, ∂x⁺/∂p of one step, by the chain rule through its four stages."""
+        """(x, u, p, h) → ∂x⁺/∂x, ∂x⁺/∂p of one step, by the chain rule through its four stages."""
         x, u, p = self._symbols
-        h = self.step
+        h = ca.SX.sym("h")
         rate = self.system.derivative
         slope = ca.Function(
             "slope",
@@ -67,36 +107,25 @@ class Propagator:
             kx = ca.mtimes(fx, ca.SX.eye(n) + part * h * kx)
             sum_x, sum_p = sum_x + weight * kx, sum_p + weight * kp
         results = [ca.densify(ca.SX.eye(n) + h / 6 * sum_x), ca.densify(h / 6 * sum_p)]
-        return ca.Function("derivatives", [x, u, p], results)
+        return ca.Function("derivatives", [x, u, p, h], results)
 
     def run(
         self, start: Float[Array, "B nx"], inputs: Float[Array, "B K m"], p: Float[Array, " r"]
     ) -> Float[Array, "B rows nx"]:
-        """States at all rows; not finite from where a segment diverges.
-
-        Args:
-            start: first state of each segment.
-            inputs: held from each row to the next.
-            p: parameters.
-        """
+        """States at all rows; not finite from where a segment diverges."""
         count, steps, _ = inputs.shape
+        h = np.broadcast_to(self.step, (count, steps))
         states = np.empty((count, steps + 1, start.shape[1]))
         states[:, 0] = start
         advance = self._advance.map(count)
         for k in range(steps):
-            states[:, k + 1] = advance(states[:, k].T, inputs[:, k].T, p).full().T
+            states[:, k + 1] = advance(states[:, k].T, inputs[:, k].T, p[:, None], h[None, :, k]).full().T
         return states
 
     def sensitivities(
         self, states: Float[Array, "B rows nx"], inputs: Float[Array, "B K m"], p: Float[Array, " r"]
     ) -> Iterator[Float[Array, "B nx columns"]]:
-        """Derivatives of the states by the segment's first state and by p, at each row from the first on.
-
-        Args:
-            states: what `run` gave.
-            inputs: held from each row to the next.
-            p: parameters.
-        """
+        """Derivatives of the states by the segment's first state and by p, at each row from the first on."""
         count, steps, _ = inputs.shape
         nx, r = states.shape[2], len(p)
         by_x, by_p = self._all_derivatives(states[:, :-1], inputs, p)
@@ -113,8 +142,9 @@ class Propagator:
         """∂x⁺/∂x and ∂x⁺/∂p of the step from each row."""
         count, steps, nx = states.shape
         rows = count * steps
+        h = np.broadcast_to(self.step, (count, steps)).ravel()
         found = self._derivatives.map(rows)(
-            states.reshape(rows, nx).T, inputs.reshape(rows, inputs.shape[2]).T, p
+            states.reshape(rows, nx).T, inputs.reshape(rows, inputs.shape[2]).T, p[:, None], h[None]
         )
         by_x, by_p = (
             d.full().reshape(nx, rows, -1).transpose(1, 0, 2).reshape(count, steps, nx, -1) for d in found

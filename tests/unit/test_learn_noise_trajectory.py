@@ -116,11 +116,25 @@ def test_every_row_counts_once() -> None:
     assert (segments.follows < 0).sum() == 2
 
 
-def test_uneven_steps_are_refused() -> None:
+def test_a_gap_is_refused() -> None:
     frame = clean().frame[:100].copy()
-    frame.loc[50:, "time"] += 1e-3
-    with pytest.raises(DataError, match="resample"):
+    frame.loc[50:, "time"] += 0.1
+    with pytest.raises(DataError, match=r"a step of 0.102 s where 0.002 s are usual"):
         cut(Dataset(frame, COORDINATES), STATES, ["v"])
+
+
+def test_steps_may_differ() -> None:
+    # Every third row on average is missing, inputs as they were held in between.
+    frame = clean().frame
+    kept = np.sort(np.random.default_rng(0).choice(len(frame), 2 * len(frame) // 3, replace=False))
+    rows = np.arange(len(frame))
+    held = np.add.reduceat(frame["v"].to_numpy(), kept) / np.diff(np.append(kept, len(frame)))
+    thin = frame.iloc[kept].assign(v=held)
+    assert rows[-1] - kept[-1] < 5
+    segments = cut(Dataset(thin, COORDINATES), STATES, ["v"])
+    assert len(np.unique(np.round(segments.steps, 6))) > 2
+    fit = maximum_likelihood(FAMILY.system(), segments, TRUE * [1.5, 0.5, 1.3, 0.8, 1.2, 0.7])
+    assert fit.p == pytest.approx(TRUE, rel=1e-3)
 
 
 def test_maximum_likelihood_finds_clean_parameters_from_a_bad_start() -> None:
