@@ -100,7 +100,9 @@ def report_card(
         names = ("lagrangian.terms", "dissipation.terms", "shapes")
         coefficients = np.concatenate([model.weights[name] for name in names])
         terms = term_table(model.spec, coefficients, np.array(model.provenance["deviations"]))
-        texts |= {"learn.objective": model.provenance["objective"], "learn.terms": formula(terms)}
+        texts["learn.terms"] = formula(terms)
+    if "objective" in model.provenance:
+        texts["learn.objective"] = model.provenance["objective"]
     evaluation, units = _evaluation(system, (tests or [train])[0])
     metrics |= _identify_metrics(found)
     return ReportCard(metrics, found.parameters, evaluation, units, texts, terms, curves(model, train))

@@ -125,6 +125,7 @@ def levenberg_marquardt(
     value: Callable[[Vector], float],
     floor: float = 0.0,
     alike: int | None = None,
+    damping: float = FIRST_DAMPING,
 ) -> Iterator[Step]:
     """Descend from `theta`; ends where no step makes the objective smaller.
 
@@ -136,11 +137,12 @@ def levenberg_marquardt(
             entries of θ have one unit, this keeps those that hardly act yet from steps so long that their own
             curvature undoes them.
         alike: so many entries, the first ones, have that unit; all if not given.
+        damping: of the first step; little where the start is good.
 
     Yields:
         The start, then every accepted step.
     """
-    damping, growth = FIRST_DAMPING, 2.0
+    growth = 2.0
     now = value(theta)
     # A caller that has seen enough is spared the Jacobian, which costs many times a value.
     yield Step(theta, now)

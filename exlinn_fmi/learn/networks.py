@@ -8,7 +8,7 @@ inputs, h hidden units.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -36,14 +36,23 @@ class _Forward:
 
 @dataclass(frozen=True)
 class StructuredNetworks:
-    """The structured form of `ModelSpec` as a function of one vector θ of its free weights."""
+    """The structured form of `ModelSpec` as a function of one vector θ of its free weights.
+
+    Args:
+        spec: the model.
+        chosen: which of its free weights θ has, the others being 0; all if not given.
+    """
 
     spec: ModelSpec
+    chosen: NDArray[np.bool_] | None = field(default=None, compare=False)
 
     @cached_property
     def _free(self) -> NDArray[np.bool_]:
         """Which of all weights, one after the other, are in θ."""
-        return np.concatenate([mask.ravel() for mask in self.spec.layout.free.values()])
+        free = np.concatenate([mask.ravel() for mask in self.spec.layout.free.values()])
+        if self.chosen is not None:
+            free[free] = self.chosen
+        return free
 
     @cached_property
     def _places(self) -> dict[str, tuple[slice, tuple[int, ...]]]:

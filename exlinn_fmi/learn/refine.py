@@ -2,7 +2,8 @@
 
 First the direct path alone, then, if that leaves more than noise, the hidden units with it: under noise the
 fewer weights that explain the data predict best. A weak prior holds weights that the data say nothing of.
-What is kept predicts the validation data best, the states that segments begin in being fitted too.
+What is kept is best by Schwarz's criterion (BIC) on training and validation data; to the latter only the
+states that segments begin in are fitted.
 """
 
 from __future__ import annotations
@@ -24,16 +25,20 @@ from exlinn_fmi.mechanics.coordinates import input_names, state_names
 
 Array = NDArray[np.float64]
 
-ROWS = 20_000
+ROWS = 10_000
 """About as many rows does the fit look at."""
-PRIOR, NEVER = 1.0, 1e12
-"""Weight of the square of a dimensionless weight that is fitted, and of one that stays 0."""
-SWEEPS = ((20, 1e-4), (10, 1e-4))
+PRIOR = 1.0
+"""Weight of the square of each dimensionless weight."""
+SWEEPS = ((20, 1e-3), (20, 1e-4))
 """Most iterations, and the least gain of one, with noise as estimated and then as the residuals show it."""
 EXPLAINED = 1.05
 """Residuals of no more than so many times the noise leave nothing to explain."""
 FLOOR = 1e-2
 """Weights are damped as if each had at least this share of the largest effect."""
+DAMPING = 1e-7
+"""The inverse model gives a good start."""
+JOINED = 1e-12
+"""The same for states alone: gaps between segments, hard to open, would else slow them down."""
 RELEVANT = 1e-6
 """Each state counts as if it had at least this noise, as a share of its standard deviation."""
 SETTLED = 1e-3
@@ -71,23 +76,28 @@ def refine(
         notes: for the model's provenance.
     """
     segments = _segments(train)
-    judge = _Judge(networks, replace(_segments(validation), sigma=segments.sigma))
+    held = replace(_segments(validation), sigma=segments.sigma)
+    count, held_count = (s.total * s.measured.shape[2] for s in (segments, held))
     for name, theta, chosen in candidates:
-        now, states, p = segments, None, np.where(chosen, theta, 0.0)
+        part = StructuredNetworks(networks.spec, chosen)
+        judge = _Judge(part, held)
+        now, states, p = segments, None, theta[chosen]
         for most, least in SWEEPS:
-            shooting = Shooting(networks, now, np.where(chosen, PRIOR, NEVER))
+            shooting = Shooting(part, now, PRIOR)
             value = np.inf
             first = shooting.start(p, states)
-            descent = levenberg_marquardt(first, shooting.normal, shooting.value, FLOOR, networks.size)
+            descent = levenberg_marquardt(first, shooting.normal, shooting.value, FLOOR, part.size, DAMPING)
             for number, step in enumerate(descent):
                 p, states = shooting.split(step.theta)
-                share, score = step.value / (now.total * now.measured.shape[2]), judge.score(p)
-                yield Iterate(networks.unpack(p), share, score, name, True, 1, notes, score)
+                fitted, judged = Shooting(part, segments).value(step.theta), judge.value(p)
+                score = fitted + judged + part.size * np.log(count + held_count)
+                shares = fitted / count, judged / held_count
+                yield Iterate(part.unpack(p), *shares, name, True, 1, notes, score)
                 if number >= most or value - step.value < least * step.value:
                     break
                 value = step.value
             now = replace(now, sigma=shooting.noise(step.theta))
-        if (now.sigma <= EXPLAINED * segments.sigma).all():
+        if fitted <= EXPLAINED**2 * count:
             break
 
 
@@ -108,8 +118,8 @@ class _Judge:
     data: Segments
     states: Float[Array, "B nx"] | None = None
 
-    def score(self, p: Float[Array, " P"]) -> float:
-        """Mean square of what is left over its noise."""
+    def value(self, p: Float[Array, " P"]) -> float:
+        """Sum of squares of what is left over its noise."""
         shooting = Shooting(self.networks, self.data)
         count = len(p)
 
@@ -117,14 +127,15 @@ class _Judge:
             at = shooting.normal(np.concatenate([p, states]))
             return Normal(at.value, at.gradient[count:], at.matrix[count:, count:])
 
-        def value(states: Float[Array, " S"]) -> float:
+        def square(states: Float[Array, " S"]) -> float:
             return shooting.value(np.concatenate([p, states]))
 
         before = np.inf
-        for step in levenberg_marquardt(shooting.start(p, self.states)[count:], linearise, value):
+        first = shooting.start(p, self.states)[count:]
+        for step in levenberg_marquardt(first, linearise, square, damping=JOINED):
             if not before - step.value > SETTLED * step.value:
                 break
             before = step.value
         if np.isfinite(step.value):
             self.states = shooting.split(np.concatenate([p, step.theta]))[1]
-        return step.value / float(self.data.total * self.data.measured.shape[2])
+        return step.value

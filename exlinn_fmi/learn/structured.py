@@ -18,6 +18,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
+from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.assembly import data_scales, inverse_assembly
 from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.learn.levenberg import levenberg_marquardt
@@ -88,7 +89,15 @@ def iterate_structured(
 
     Yields:
         The start of each stage and every iteration.
+
+    Raises:
+        TrainingError: the objective is one for sums of terms alone.
     """
+    if objective == "weak":
+        raise TrainingError(
+            "the objective 'weak' takes the preset 'terms'; for networks choose 'trajectory', 'inverse' or "
+            "'auto'"
+        )
     networks = StructuredNetworks(spec)
     best: dict[str, Iterate] = {}
     notes = {"objective": choose(objective, train)[1], "noise": relative_noise(train)}

@@ -135,7 +135,12 @@ def test_bounded_inputs_move_any_model_within_its_energy_for_ever(kind: str, see
 
 def test_a_model_trained_on_noise_is_passive_too() -> None:
     data = motor_cart_data(noise=0.05, seconds=2.0)
-    model = train(*split(data, 0.8, 10, 0), Structured(preset="structured", hidden=4, iterations=30), 0)
+    model = train(
+        *split(data, 0.8, 10, 0),
+        Structured(preset="structured", hidden=4, iterations=30),
+        0,
+        objective="inverse",
+    )
     assert_bounded(model.spec, model.weights, 0)
 
 
@@ -294,7 +299,8 @@ def judged(data: Dataset, test: Dataset, time: float, position: tuple[float, ...
     """Force error relative to the forces, errors of the free run, and the motor's parameters in SI units."""
     data, test = rescaled(data, time, position), rescaled(test, time, position)
     part, held = split(data, 0.8, 10, 0)
-    model = train(part, held, Structured(preset="structured", hidden=4, iterations=40), 0)
+    options = Structured(preset="structured", hidden=4, iterations=40)
+    model = train(part, held, options, 0, objective="inverse")
     error = force_error(model.system, test) / model.spec.scales.force
     run = nrmse(model.system, test, free_run(model.system, test), float(np.ptp(test.frame["time"])))
     found = parameters(model, part, time, position) if data.coordinates[0].name == "alpha" else []
