@@ -5,7 +5,7 @@ polynomial in the positions; then, if the target is not met, with the hidden uni
 linear start of their own, whichever is better; both on every k-th sample, since sampled
 motion repeats itself. The last stage takes all samples.
 
-Where states are noisy, or accelerations do not fit, what comes of it is refined on trajectories (`refine`).
+Where states are noisy, what comes of it is refined on trajectories (`refine`).
 """
 
 from __future__ import annotations
@@ -136,10 +136,9 @@ def choose(objective: Goal, data: Dataset, loss: float = 0.0) -> tuple[Goal, str
         why = f"{worst} has {100 * noise[worst]:.2g} % noise, the most of all states"
         return "trajectory", f"trajectory: {why}"
     if loss > CONSISTENT**2:
-        why = (
-            f"states are clean, but {100 * float(np.sqrt(loss)):.2g} % of forces do not fit the accelerations"
-        )
-        return "trajectory", f"trajectory: {why}"
+        share = f"{100 * float(np.sqrt(loss)):.2g} % of forces do not fit the accelerations"
+        doubt = "noise that was filtered looks like motion; 'trajectory' fits the states themselves"
+        return "inverse", f"inverse: states look clean, but {share}: {doubt}"
     return "inverse", "inverse: the states are clean and the accelerations do not contradict them"
 
 

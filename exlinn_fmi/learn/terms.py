@@ -164,7 +164,7 @@ def _stages(
     Clean data are fitted by least squares. What this leaves tells whether the accelerations are as clean as
     the states; if not, the weak form tells all but a few terms apart, and those are fitted to trajectories.
     """
-    if objective != "auto" or not even(data) or max(relative_noise(data).values()) > CLEAN:
+    if objective != "auto" or max(relative_noise(data).values()) > CLEAN:
         chosen, why = choose(objective, basis, data)
         if chosen != "trajectory":
             return _least_squares(basis, masks, data, chosen, held), why
