@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import ctypes
 import json
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -384,6 +385,45 @@ def platforms(quick: bool) -> Figures:
     }
 
 
+def emulated(quick: bool) -> Figures:
+    """Binaries of other platforms under emulators: largest relative difference from this machine's."""
+    tools = {"x86_64-windows": shutil.which("wine"), "aarch64-linux": shutil.which("qemu-aarch64")}
+    if not has_zig() or not all(tools.values()):
+        return {"emulated": "needs ziglang, wine64, qemu-user and libc6-arm64-cross"}
+    here = _sources(learned(platforms=tuple(PLATFORMS))).parent
+    token = fmpy.read_model_description(str(here)).guid
+    zig = [sys.executable, "-m", "ziglang"]
+    kernel = "LoadLibraryA GetProcAddress GetStdHandle WriteFile ExitProcess GetCommandLineA"
+    (here / "k.def").write_text("\n".join(["LIBRARY kernel32.dll", "EXPORTS", *kernel.split(), ""]))
+    make_library = [*zig, "dlltool", "-m", "i386:x86-64", "-d", "k.def", "-l", "k.lib"]
+    subprocess.run(make_library, cwd=here, check=True, capture_output=True)
+    arm = PLATFORMS["aarch64-linux"].target
+    builds: dict[str, tuple[list[str], list[str], str]] = {
+        "host": ([*find_compiler(), "-ldl"], [], "binaries/linux64/Learned.so"),
+        "aarch64-linux": (
+            [*zig, "cc", "-target", arm, "-ldl"],
+            [tools["aarch64-linux"] or "", "-L", "/usr/aarch64-linux-gnu"],
+            "binaries/aarch64-linux/Learned.so",
+        ),
+        "x86_64-windows": (
+            [*zig, "cc", "-target", "x86_64-windows-gnu", "-nostdlib", "k.lib"],
+            [tools["x86_64-windows"] or ""],
+            "binaries\\win64\\Learned.dll",
+        ),
+    }
+    values = {}
+    for name, (compiler, emulator, library) in builds.items():
+        program = f"./run_{name}.exe"
+        command = [*compiler[:-1], "-w", "-O1", str(HERE / "export_run.c"), compiler[-1], "-o", program]
+        subprocess.run(command, cwd=here, check=True, capture_output=True)
+        told = subprocess.run(
+            [*emulator, program, library, token], cwd=here, check=True, capture_output=True, text=True
+        ).stdout
+        values[name] = np.array([int(line, 16) for line in told.split()], dtype=np.uint64).view(np.float64)
+    host = values.pop("host")
+    return {f"emulated.{n}.max_rel": float(np.abs(v / host - 1).max()) for n, v in values.items()}
+
+
 def fuzz(quick: bool) -> Figures:
     """Random calls, legal and not, under the address and undefined-behaviour sanitisers."""
     calls, findings = 10_000 if quick else 100_000, 0
@@ -407,6 +447,7 @@ FIGURES: dict[str, Callable[[bool], Figures]] = {
     "speed": speed,
     "controller": controller,
     "platforms": platforms,
+    "emulated": emulated,
     "fuzz": fuzz,
 }
 """What is measured: each makes figures, given whether to be quick."""
