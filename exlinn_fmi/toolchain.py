@@ -123,16 +123,20 @@ def cached_library(sources: Mapping[str, bytes], main: str, flags: Sequence[str]
 
 
 def cache_folder() -> Path:
-    """Where compiled libraries are kept."""
+    """Where compiled libraries and unpacked FMUs are kept; it need not exist.
+
+    Raises:
+        RuntimeError: the user has no home.
+    """
     if folder := os.environ.get("EXLINN_CACHE"):
-        return Path(folder)
+        return Path(folder).absolute()
     if sys.platform == "win32":
         base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
     elif sys.platform == "darwin":
         base = Path.home() / "Library" / "Caches"
     else:
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return base / "exlinn-fmi"
+    return base / "exlinn"
 
 
 @functools.cache

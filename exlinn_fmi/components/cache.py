@@ -22,6 +22,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from exlinn_fmi.toolchain import cache_folder
+
 CONTENT, LISTING = "content", "files.json"
 UNFINISHED = "new-"
 """What folders begin with that are being filled or removed, or are one user's alone."""
@@ -80,21 +82,6 @@ def lease(key: str, fill: Callable[[Path], None], alone: bool = False) -> Lease:
             return Lease(entry / CONTENT, lambda: _leave(entry))
     folder, lock = _filled(root, fill)
     return Lease(folder / CONTENT, lambda: _remove(folder, lock))
-
-
-def cache_folder() -> Path:
-    """The folder of the cache, which need not exist.
-
-    Raises:
-        RuntimeError: the user has no home.
-    """
-    if given := os.environ.get("EXLINN_CACHE"):
-        return Path(given).absolute()
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA") or tempfile.gettempdir(), "exlinn", "cache")
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "exlinn"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "exlinn")
 
 
 def _root() -> Path:

@@ -157,19 +157,6 @@ def test_a_cache_that_cannot_be_written_is_done_without(
     held.release()
 
 
-def test_the_folder_is_where_users_expect_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("EXLINN_CACHE")
-    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
-    found = {}
-    for platform in ("linux", "darwin", "win32"):
-        monkeypatch.setattr(sys, "platform", platform)
-        monkeypatch.setenv("LOCALAPPDATA", "/local")
-        found[platform] = str(cache.cache_folder())
-    assert found["linux"] == "/somewhere/exlinn"
-    assert found["darwin"].endswith("Library/Caches/exlinn")
-    assert found["win32"] == "/local/exlinn/cache"
-
-
 def use(key: str, times: int) -> int:
     """What each of several processes does: ask for a folder and look whether it is whole."""
     good = 0

@@ -83,9 +83,9 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize(
     ("system", "variable", "expected"),
     [
-        ("linux", "XDG_CACHE_HOME", "exlinn-fmi"),
-        ("win32", "LOCALAPPDATA", "exlinn-fmi"),
-        ("darwin", "HOME", "Library/Caches/exlinn-fmi"),
+        ("linux", "XDG_CACHE_HOME", "exlinn"),
+        ("win32", "LOCALAPPDATA", "exlinn"),
+        ("darwin", "HOME", "Library/Caches/exlinn"),
     ],
 )
 def test_the_cache_is_where_each_system_keeps_caches(
