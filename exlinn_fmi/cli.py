@@ -77,7 +77,7 @@ class Terminal:
 
     def note(self, text: str) -> None:
         """Something that the user should know."""
-        self.console.print(f"warning: {text}", markup=False)
+        self.console.print(text, markup=False)
 
     def close(self) -> None:
         """Take the bar away."""

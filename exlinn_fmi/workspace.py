@@ -126,7 +126,7 @@ class Run:
         """Tell the user, and the report, of something; once, however often it comes up."""
         if text not in self.warnings:
             self.warnings.append(text)
-            self.reporter.note(text)
+            self.reporter.note(f"warning: {text}")
 
     # ── the run folder ───────────────────────────────────────────────────────────────────────────────────
 
