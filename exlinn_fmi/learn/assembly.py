@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Assembly:
-    """Coefficients at B samples: r = value · f + gradient · ∂f/∂z + (K − Kᵀ)q̇ + ∂D/∂q̇ − target.
+    """Coefficients at B samples: r = value · f + gradient · ∂f/∂z + (K − Kᵀ)q̇ + ∂D/∂q̇ − push · F₀ − target.
 
     Args:
         z: network inputs (B, nz).
@@ -36,6 +36,7 @@ class Assembly:
         velocity: q̇ (B, n).
         value: of each function f_t in each equation (B, n, T).
         gradient: of each derivative ∂f_t/∂z_j in each equation (B, n, T, nz).
+        push: of the constant force F₀ in each equation (B, n).
         target: F (B, n).
     """
 
@@ -45,6 +46,7 @@ class Assembly:
     velocity: Float[Array, "B n"]
     value: Float[Array, "B n T"]
     gradient: Float[Array, "B n T nz"]
+    push: Float[Array, "B n"]
     target: Float[Array, "B n"]
 
     def __len__(self) -> int:
@@ -56,7 +58,8 @@ class Assembly:
 
     def inertia(self) -> Assembly:
         """Coefficients of the inertial forces M q̈ alone."""
-        none = {name: np.zeros_like(getattr(self, name)) for name in ("velocity", "gradient", "target")}
+        others = ("velocity", "gradient", "push", "target")
+        none = {name: np.zeros_like(getattr(self, name)) for name in others}
         return replace(self, **none)
 
     def chunks(self, size: int) -> Iterator[Assembly]:
@@ -112,7 +115,7 @@ def inverse_assembly(spec: ModelSpec, samples: Samples) -> Assembly:
         for j, k in enumerate(owners):
             gradient[:, k, t, j] -= monomial * slope[:, j]
     basis, slopes = product_basis(z, spec.layout.products)
-    return Assembly(z, basis, slopes, w, value, gradient, samples.F / spec.scales.force)
+    return Assembly(z, basis, slopes, w, value, gradient, np.ones_like(w), samples.F / spec.scales.force)
 
 
 def product_basis(

@@ -96,7 +96,8 @@ class StructuredNetworks:
         residual = np.einsum("bnt,bt->bn", data.value, f) - data.target
         residual += np.einsum("bntz,btz->bn", data.gradient, df)
         residual += coupling_columns(self.spec.layout, data.velocity) @ weights["lagrangian.coupling"]
-        residual += weights["dissipation.viscous"] ** 2 * data.velocity - weights["lagrangian.offset"]
+        residual += weights["dissipation.viscous"] ** 2 * data.velocity
+        residual -= weights["lagrangian.offset"] * data.push
         a, s = weights["dissipation.friction"], friction_width(weights)
         slip = self._slip(data.velocity[:, :, None] / s)
         residual += np.einsum("nk,bnk->bn", a**2 * s, slip[0])
@@ -206,7 +207,7 @@ class StructuredNetworks:
             "lagrangian.output": value.T @ forward.basis
             + np.tensordot(slope, forward.slopes, axes=((0, 2), (0, 2))),
             "lagrangian.coupling": np.array([power[i, j] - power[j, i] for i, j in layout.couplings]),
-            "lagrangian.offset": -pull.sum(axis=0),
+            "lagrangian.offset": -(pull * data.push).sum(axis=0),
             "dissipation.viscous": 2 * weights["dissipation.viscous"] * np.diag(power),
             **self._pull_hidden(weights, forward, data, value, slope),
             **_pull_friction(weights, forward, data, pull),
@@ -269,10 +270,9 @@ class StructuredNetworks:
             output += gradient[..., j, None] * forward.slopes[:, None, None, :, j]
         parts = [*self._hidden_columns(weights, forward, data, value, gradient)]
         parts.append(output.reshape(rows, n, count * layout.basis))
-        own = np.broadcast_to(np.eye(n), (rows, n, n))
         parts += [
             coupling_columns(layout, data.velocity),
-            -own,
+            -np.eye(n) * data.push[:, :, None],
             *_dissipation_columns(weights, forward, data),
         ]
         return forward.residual, np.concatenate(parts, axis=2)[:, :, self._free]

@@ -54,6 +54,9 @@ def test_jacobian_is_the_derivative_of_the_residual(coordinates: tuple[Coordinat
 def test_inertial_forces_are_what_accelerations_add() -> None:
     coordinates = SYSTEMS[2]
     spec, weights = random_model(5, coordinates)
+    # A constant force is no inertia.
+    spec = dataclasses.replace(spec, structure=Structure(offset=(True,) * len(coordinates)))
+    weights = {**weights, "lagrangian.offset": np.arange(1.0, len(coordinates) + 1)}
     samples = random_samples(6, coordinates)
     networks = StructuredNetworks(spec)
     theta = networks.pack(dict(weights))
