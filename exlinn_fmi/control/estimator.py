@@ -163,7 +163,10 @@ class Estimator(ABC):
         if not len(seen):
             return mean, P
         R = np.diag(self.noise.measurement[seen] ** 2)
-        K = np.linalg.solve(P[np.ix_(seen, seen)] + R, P[seen]).T
+        try:
+            K = np.linalg.solve(P[np.ix_(seen, seen)] + R, P[seen]).T
+        except np.linalg.LinAlgError:  # P has grown until R is lost in rounding: nothing is known any more
+            return np.full_like(mean, np.nan), P
         rest = np.eye(len(mean))
         rest[:, seen] -= K
         return mean + K @ difference, rest @ P @ rest.T + K @ R @ K.T

@@ -369,3 +369,23 @@ def test_an_estimate_that_was_led_astray_begins_anew():
     made._memory = replace(made._memory, belief=replace(made._memory.belief, mean=np.full(5, np.nan)))
     outputs, status = measure(made, *START)
     assert (status, outputs["estimate_alpha"]) == (Status.OK, START[0])
+
+
+def test_a_covariance_in_which_the_noise_is_lost_begins_anew():
+    made = observer()
+    measure(made, *START)
+    made.step(0.0, STEP)
+    lost = replace(made._memory.belief, covariance=np.full((5, 5), 1e120))
+    assert not made._estimator.update(lost, START).finite
+    made._memory = replace(made._memory, belief=lost)
+    outputs, status = measure(made, *START)
+    assert (status, outputs["estimate_alpha"]) == (Status.OK, START[0])
+
+
+@pytest.mark.parametrize("seed", [0, 102, 773, 861])
+def test_measurements_that_no_motion_explains_end_in_no_exception(seed):
+    made, rng = observer(), np.random.default_rng(seed)
+    for k, y in enumerate(3 * rng.normal(size=(31, 3))):
+        outputs, _ = measure(made, y[0], 0.0, y[2])
+        made.step(k * STEP, STEP)
+        assert np.isfinite(outputs["v"])
