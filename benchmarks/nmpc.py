@@ -1,13 +1,13 @@
-"""Speed, scaling and exactness of the model predictive controller, and peers on the same problem.
+"""Speed and scaling of the model predictive controller, and peers on the same problem.
 
     python benchmarks/nmpc.py [--quick] [--only NAME …] [--json FILE]
 
-The problem is that of the paper's DC motor with cart: a learned model with 1×32 tanh units, 30 intervals of
-10 ms, |v| ≤ 24 V, |i| ≤ 4 A, the cart on a sine of 150 mm at 0.4 Hz. A closed loop around the true plant is
-recorded; then each contestant solves it tick by tick. Times are CPU times of one pinned core, calls from
-Python included. Peers: CasADi with IPOPT as it is usually written (exact Hessian, interpreted), our own
-CasADi path, do-mpc (the real library), and acados with HPIPM where ACADOS_SOURCE_DIR is set. What
-`tracking.py` measures stands in the same table.
+The problem is the cart's, see `baselines/cart.py`. A closed loop around the true plant is recorded; then each
+contestant solves it tick by tick. Times are CPU times of one pinned core, calls from Python included. Peers:
+CasADi with IPOPT as it is usually written (exact Hessian, interpreted), our own CasADi path, do-mpc (the real
+library), and where ACADOS_SOURCE_DIR is set, acados in real-time iteration with HPIPM, as it is fastest and
+(`acados_default`) as its options are if nothing is said. What `agreement.py` and `tracking.py` measure stands
+in the same table.
 """
 
 from __future__ import annotations
@@ -19,93 +19,26 @@ import os
 import sys
 import time
 import tracemalloc
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
+import agreement
 import numpy as np
-from baselines.bench import multisine, paper, trained
-from baselines.record import record
+import tracking
+from baselines.cart import START, STEP, Problem, problem
 from numpy.typing import NDArray
 
 from exlinn_fmi.control.batch import Batch
 from exlinn_fmi.control.compiled import Kernel
-from exlinn_fmi.control.ocp import Ocp
-from exlinn_fmi.control.realtime import CompiledGaussNewton
-from exlinn_fmi.control.reference import ReferenceGenerator, References
+from exlinn_fmi.control.reference import References
 from exlinn_fmi.control.solver import Plan, Solver, SolveStatus, make_solver
-from exlinn_fmi.mechanics.learned import ModelSpec, Weights, learned_system
 from exlinn_fmi.plants.dc_motor_cart import PLANT
-from exlinn_fmi.scenario.control import Nmpc, Reference, ScotchYoke
-from exlinn_fmi.scenario.control import Weights as Cost
-from exlinn_fmi.scenario.learning import Structured
-from exlinn_fmi.scenario.signals import Sine
-from exlinn_fmi.scenario.spec import Bounds
 
 Figures = dict[str, float | str]
-STEP = 0.01
-START = np.array([np.pi / 2, 0.0, 0.0])
-HERE = Path(__file__).parent
-CART = Reference(
-    coordinate="alpha",
-    trajectory=Sine(signal="sine", amplitude=0.15, frequency=0.4, unit="m"),
-    through=ScotchYoke(map="scotch_yoke", crank=0.2),
-)
 
 
-# ── the problem ──────────────────────────────────────────────────────────────────────────────────────────
-
-
-@lru_cache
-def weights() -> tuple[ModelSpec, Weights]:
-    """The learned model: 32 tanh units, from two trajectories of the plant."""
-    data = record(PLANT, "v", [paper(), multisine(1)], 10)
-    model, _ = trained(data, Structured(preset="structured", hidden=32, iterations=60), 0)
-    return model.spec, model.weights
-
-
-def widened(spec: ModelSpec, given: Weights, factor: int) -> tuple[ModelSpec, Weights]:
-    """The same function with that many times the hidden units."""
-    wide = {name: np.array(value) for name, value in given.items()}
-    for name in ("hidden.weight", "hidden.bias"):
-        key = f"lagrangian.{name}"
-        wide[key] = np.concatenate([wide[key]] * factor)
-    output = wide["lagrangian.output"]
-    direct, hidden = output[:, : -spec.hidden], output[:, -spec.hidden :]
-    wide["lagrangian.output"] = np.hstack([direct, *[hidden / factor] * factor])
-    for name, by in (("friction", np.sqrt(factor)), ("width", 1.0)):
-        wide[f"dissipation.{name}"] = np.hstack([wide[f"dissipation.{name}"] / by] * factor)
-    return replace(spec, hidden=spec.hidden * factor), wide
-
-
-class Problem(NamedTuple):
-    """A learned model's optimal control problem, and its references."""
-
-    ocp: Ocp
-    references: ReferenceGenerator
-
-    def aim(self, time: float, x: NDArray[np.float64], last: References | None = None) -> References:
-        """The reference over the horizon that begins at `time` [s]."""
-        return self.references.over(time, x, self.references.branch(x), last)
-
-
-@lru_cache
-def problem(horizon: int = 30, factor: int = 1) -> Problem:
-    """The problem, with another horizon or a wider network."""
-    system = learned_system(*widened(*weights(), factor)).with_inputs({"v"})
-    options = Nmpc(
-        reference=CART,
-        horizon=horizon,
-        substeps=1,
-        weights=Cost(states=10.0, inputs=1e-3),
-        inputs={"v": Bounds(min=-24.0, max=24.0)},
-        states={"i": Bounds(min=-4.0, max=4.0)},
-    )
-    references = ReferenceGenerator(system, options.reference, HERE, STEP, horizon)
-    return Problem(Ocp(system, options, STEP, references.states), references)
+# ── a closed loop ────────────────────────────────────────────────────────────────────────────────────────
 
 
 class Loop(NamedTuple):
@@ -213,11 +146,12 @@ def speed(quick: bool) -> Figures:
     given = problem()
     ours, loop = our_times(given, 200 if quick else 1000)
     figures = microseconds(ours.step, "speed.step") | microseconds(ours.feedback, "speed.feedback")
-    step = float(np.median(ours.step))
+    step, feedback = float(np.median(ours.step)), float(np.median(ours.feedback))
     few = Loop(loop.states[: 20 if quick else 150], loop.aims[: 20 if quick else 150])
     for name, times in peers(given, few):
         figures |= microseconds(times, f"speed.{name}")
-        figures[f"speed.{name}_over_ours"] = float(np.median(times)) / step
+        mine = feedback if name.endswith("feedback") else step
+        figures[f"speed.{name}_over_ours"] = float(np.median(times)) / mine
     return figures
 
 
@@ -233,7 +167,10 @@ def peers(given: Problem, loop: Loop) -> Iterator[tuple[str, NDArray[np.float64]
     if os.environ.get("ACADOS_SOURCE_DIR"):
         from baselines.acados import Acados
 
-        yield "acados", Acados(given.ocp).times(loop.states, loop.aims)
+        step, feedback = Acados(given.ocp, "SQP_RTI").times(loop.states, loop.aims)
+        yield "acados", step
+        yield "acados_feedback", feedback
+        yield "acados_default", Acados(given.ocp, "SQP_RTI", tuned=False).times(loop.states, loop.aims)[0]
 
 
 def scaling(quick: bool) -> Figures:
@@ -245,66 +182,6 @@ def scaling(quick: bool) -> Figures:
         for given in (problem(), problem(horizon=300), problem(factor=8))
     )
     return {"scaling.N300_over_N30": longer / base, "scaling.width256_over_width32": wider / base}
-
-
-# ── exactness ────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def agree(quick: bool) -> Figures:
-    """Converged plans against hpipm, each hundredth against IPOPT: random states, bounds and weights."""
-    count = 200 if quick else 10_000
-    given, rng = problem.__wrapped__(), np.random.default_rng(0)  # one of its own, since it is changed
-    ocp = given.ocp
-    ours = make_solver(ocp, "sqp", 100, 1e-9, "compiled")
-    hpipm = make_solver(ocp, "sqp", 100, 1e-9, "casadi")
-    assert isinstance(ours, CompiledGaussNewton)
-    lost: Counter[str] = Counter()
-    first, whole, by_ipopt, excess = [0.0], [0.0], [0.0], [0.0]
-    for k in range(count):
-        x0 = rng.uniform([0.2, -5.0, -4.5], [2.9, 5.0, 4.5])
-        draw(ocp, ours.kernel, rng)
-        aim = given.aim(rng.uniform(0.0, 2.5), x0)
-        one, other = ours.solve(x0, aim), hpipm.solve(x0, aim)
-        lost["ours"] += one.status != SolveStatus.SOLVED
-        lost["hpipm"] += other.status != SolveStatus.SOLVED
-        if one.status == other.status == SolveStatus.SOLVED:
-            first.append(float(np.abs(one.u[0] - other.u[0]).max()))
-            whole.append(float(np.abs(one.u - other.u).max()))
-            costs = [found.stats.cost + ocp.penalty(found.x) for found in (one, other)]
-            excess.append((costs[0] - costs[1]) / max(1.0, costs[1]))
-        if k % 100 == 0:
-            # Bounds and weights are constants of its problem: it is made anew.
-            third = make_solver(ocp, "ipopt", 300, 1e-9).solve(x0, aim)
-            lost["ipopt"] += third.status != SolveStatus.SOLVED
-            if third.status == one.status == SolveStatus.SOLVED:
-                cost = third.stats.cost + ocp.penalty(third.x)
-                gain = (cost - one.stats.cost - ocp.penalty(one.x)) / max(1.0, cost)
-                if abs(gain) < 1e-6:
-                    by_ipopt.append(float(np.abs(one.u[0] - third.u[0]).max()))
-                else:  # the problem is not convex: both are minima
-                    lost["lower" if gain > 0.0 else "higher"] += 1
-    return {
-        "agree.problems": count,
-        "agree.failures": lost["ours"],
-        "agree.hpipm_failures": lost["hpipm"],
-        "agree.ipopt_failures": lost["ipopt"],
-        "agree.max_dv_converged": max(first),
-        "agree.max_dv_whole_plan": max(whole),
-        "agree.max_dv_ipopt": max(by_ipopt),
-        "agree.lower_minima_than_ipopt": lost["lower"],
-        "agree.higher_minima_than_ipopt": lost["higher"],
-        "agree.max_cost_excess": max(excess),
-    }
-
-
-def draw(ocp: Ocp, kernel: Kernel, rng: np.random.Generator) -> None:
-    """Put random bounds and a random weight into a problem."""
-    lim, bound, current = ocp.limits, rng.uniform(4.0, 24.0), rng.uniform(1.0, 4.0)
-    changed = {"u_min": (lim.u_min, -bound), "u_max": (lim.u_max, bound), "x_min": (lim.x_min, -current)}
-    changed |= {"x_max": (lim.x_max, current), "R": (ocp.R, 10.0 ** rng.uniform(-4.0, -2.0))}
-    for name, (array, value) in changed.items():
-        array[:] = value
-        kernel.array(name, *array.shape)[:] = array
 
 
 # ── memory ───────────────────────────────────────────────────────────────────────────────────────────────
@@ -340,15 +217,11 @@ def memory(quick: bool) -> Figures:
 FIGURES: dict[str, Callable[[bool], Figures]] = {
     "speed": speed,
     "scaling": scaling,
-    "agree": agree,
     "memory": memory,
+    **agreement.FIGURES,
+    **tracking.FIGURES,
 }
 """What is measured: each makes figures, given whether to be quick."""
-
-if importlib.util.find_spec("tracking"):
-    import tracking
-
-    FIGURES |= tracking.FIGURES
 
 BARS: dict[str, tuple[float, float]] = {
     "speed.ipopt_vm_over_ours": (300, 1500),

@@ -90,13 +90,14 @@ class GaussNewton(PlainSolver):
         self, plan: Plan, at: Linearisation, targets: Targets, dx0: Float[np.ndarray, " n"]
     ) -> QpSolution:
         """The solution of the quadratic program at a plan, for a state that is off its first one by dx0."""
-        qp = self._stage_qp(plan, at, targets, dx0)
+        qp = self.stage_qp(plan, at, targets, dx0)
         step = self.qp.solve(_with_rates(qp, plan.u, self.ocp.limits) if self.ocp.limits.rated else qp)
         return replace(step, dx=step.dx[:, : self.ocp.n])
 
-    def _stage_qp(
+    def stage_qp(
         self, plan: Plan, at: Linearisation, targets: Targets, dx0: Float[np.ndarray, " n"]
     ) -> StageQp:
+        """The quadratic program at a plan, for a state off its first by dx0; without bounds on rates."""
         ocp, lim = self.ocp, self.ocp.limits
         first_low, first_high = ocp.first_bounds(targets.applied)
         e = plan.x - targets.x

@@ -111,7 +111,7 @@ class QpSolver(ABC):
 
 
 class ConicQp(QpSolver):
-    """A solver that comes with CasADi: `hpipm` (interior point, Riccati) or `qrqp` (active set, sparse).
+    """A solver of CasADi: `hpipm` (interior point, Riccati), `qrqp` (active set, sparse), `qpoases`.
 
     Variables are ordered (u_0, s_0, x_1, u_1, s_1, …, x_N) and constraints stage by stage, the structure that
     hpipm works on. dx_0 is put into the first stage's constants.
@@ -155,7 +155,7 @@ class ConicQp(QpSolver):
                 "inf": INFINITE,
                 "hpipm": {"mode": "balance", "iter_max": 60} | residuals,
             }
-        else:
+        elif plugin == "qrqp":
             options |= {"print_header": False, "print_iter": False, "print_info": False}
         self._solver = ca.conic("qp", plugin, {"h": layout.h.sparsity, "a": layout.a.sparsity}, options)
         # CasADi keeps the addresses only, and a plugin may read arguments that were never set: set them all.

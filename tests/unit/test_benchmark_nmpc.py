@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import agreement
 import nmpc
 import numpy as np
 import pytest
 from baselines.do_mpc import DoMpc
 
 from exlinn_fmi.control.compiled import Kernel
-from exlinn_fmi.control.solver import make_solver
+from exlinn_fmi.control.gauss_newton import GaussNewton
+from exlinn_fmi.control.solver import Plan, make_solver
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +37,29 @@ def test_the_recorded_loop_tracks_and_every_contestant_takes_it(given):
     for name, times in nmpc.peers(given, few):
         assert name
         assert times.shape == (2,)
+
+
+def test_the_exact_step_leaves_a_converged_plan_and_mends_another(given):
+    plain = make_solver(given.ocp, "sqp", 50, 1e-9, "casadi")
+    assert isinstance(plain, GaussNewton)
+    aim = given.aim(0.0, nmpc.START)
+    found = make_solver(given.ocp, "sqp", 50, 1e-9).solve(nmpc.START, aim)
+    exact = agreement.Exact(plain)
+    assert exact.step(Plan(found.x, found.u), found.targets) < 1e-8
+    other = found.u.copy()
+    other[20] += 1e-3
+    assert exact.step(Plan(found.x, other), found.targets) == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_a_plan_of_another_minimum_is_counted_as_such(given):
+    found = make_solver(given.ocp, "sqp", 50, 1e-9).solve(nmpc.START, given.aim(0.0, nmpc.START))
+    peer = agreement.Peer("peer", lambda: None)
+    assert peer.compare(given.ocp, found, Plan(found.x, found.u + 1e-7)) == pytest.approx(1e-7)
+    assert peer.compare(given.ocp, found, Plan(found.x + 0.1, found.u)) == 0.0
+    assert peer.compare(given.ocp, found, None) == 0.0
+    counted = peer.figures()
+    assert counted["agree.max_dv_whole_peer"] == pytest.approx(1e-7)
+    assert counted["agree.lower_minima_than_peer"] == counted["agree.peer_failures"] == 1
 
 
 def test_a_wider_network_is_the_same_function(given):
