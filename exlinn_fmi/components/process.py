@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import mmap
 import os
-import select
 import signal
 import subprocess
 import sys
@@ -19,6 +18,7 @@ import numpy as np
 
 from exlinn_fmi.components import worker
 from exlinn_fmi.components.base import Values
+from exlinn_fmi.components.waiting import Waiter
 
 POLLS = sys.platform != "win32"
 """Whether a pipe can be waited for; if not, a timer ends the process, which ends the wait as well."""
@@ -71,9 +71,10 @@ class Process:
         assert self._popen.stdout is not None
         self._requests, self._replies = self._popen.stdin.fileno(), self._popen.stdout.fileno()
         self._how = ""
-        self._poll = select.poll() if POLLS else None
-        if self._poll is not None:
-            self._poll.register(self._replies, select.POLLIN)
+        others = self.block[worker.OTHERS : worker.OTHERS + 1]
+        self._waiter = Waiter(self._replies, others) if POLLS else None
+        _running.add(self)
+        _tell_number()
 
     def send(self, data: bytes) -> None:
         """Write a request.
@@ -109,10 +110,8 @@ class Process:
 
     def _read(self, size: int) -> tuple[bytes, bool]:
         """What there is to read, nothing where the process has ended or the time is up; and whether it is."""
-        if self._poll is not None:
-            return (
-                (os.read(self._replies, size), False) if self._poll.poll(1e3 * self.timeout) else (b"", True)
-            )
+        if self._waiter is not None:
+            return (os.read(self._replies, size), False) if self._waiter.wait(self.timeout) else (b"", True)
         expired = False
 
         def expire() -> None:
@@ -150,6 +149,8 @@ class Process:
         """
         if self.alive:
             self.alive = False
+            _running.discard(self)
+            _tell_number()
             if patience:
                 with suppress(subprocess.TimeoutExpired):
                     self._popen.wait(patience)
@@ -160,6 +161,15 @@ class Process:
             for pipe in (self._popen.stdin, self._popen.stdout):
                 assert pipe is not None
                 pipe.close()
+
+
+_running: set[Process] = set()
+
+
+def _tell_number() -> None:
+    """Tell all processes how many there are."""
+    for process in tuple(_running):
+        process.block[worker.OTHERS] = len(_running)
 
 
 def _physical_memory() -> float:

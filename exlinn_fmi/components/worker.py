@@ -26,6 +26,7 @@ import numpy as np
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values
 from exlinn_fmi.components.texts import handle, text
+from exlinn_fmi.components.waiting import Waiter
 
 REQUEST = struct.Struct("<iiiidd")
 """Kind, slot to set, slot to get, bytes that follow, t [s], h [s]; a slot is -1 where there is none."""
@@ -43,8 +44,8 @@ FAILED = 256
 
 INSTANTIATION, SETTING, READING, STEPPING, OTHER = range(5)
 """Stages, of which the present one stands in the first 8 bytes of the block: it tells where a crash was."""
-FIRST = 1
-"""Place in the block from which slots lie."""
+OTHERS, FIRST = 1, 2
+"""Places in the block of the number of such processes, and from which slots lie."""
 
 
 class Worker:
@@ -69,7 +70,13 @@ class Worker:
         """Answer until the parent closes the component or is gone."""
         size, unpack = REQUEST.size, REQUEST.unpack
         posted, said = Status.OK, ""
-        while len(request := os.read(self._requests, size)) == size:
+        waiter = None if sys.platform == "win32" else Waiter(self._requests, self._block[OTHERS : OTHERS + 1])
+        while True:
+            if waiter is not None:
+                waiter.look()
+            request = os.read(self._requests, size)
+            if len(request) < size:
+                return
             kind, given, taken, length, t, h = unpack(request)
             call = json.loads(self._read(length)) if kind == CALL else None
             if posted >= Status.DISCARD:

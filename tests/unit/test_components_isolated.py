@@ -146,6 +146,17 @@ def test_more_sets_of_variables_than_the_memory_holds_are_no_trouble(tmp_path: P
     component.close()
 
 
+def test_processes_know_how_many_they_are(tmp_path: Path) -> None:
+    path = probe(tmp_path)
+    components = [isolated(path) for _ in range(3)]
+    blocks = [component._process.block for component in components]
+    assert [block[worker.OTHERS] for block in blocks] == [3, 3, 3]
+    components[1].close()
+    assert [blocks[k][worker.OTHERS] for k in (0, 2)] == [2, 2]
+    for component in components:
+        component.close()
+
+
 def test_what_an_fmu_prints_does_not_disturb(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = probe(tmp_path, 'HARM=printf("hello"); fflush(stdout)', "HARM_IN=GET")
     driver = Driver(isolated(path)).begin()
