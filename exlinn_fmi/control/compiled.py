@@ -59,7 +59,17 @@ class Head(ctypes.Structure):
         ),
         *(
             (name, ctypes.c_double)
-            for name in ("step", "tolerance", "terminal", "kkt", "cost", "slack", "allowed")
+            for name in (
+                "step",
+                "tolerance",
+                "terminal",
+                "set_weight",
+                "level",
+                "kkt",
+                "cost",
+                "slack",
+                "allowed",
+            )
         ),
         ("extend", ctypes.c_longlong),
     ]
@@ -126,6 +136,7 @@ class Kernel:
             step=ocp.step,
             tolerance=tolerance,
             terminal=0.0 if ocp.terminal == "dare" else ocp.terminal,
+            set_weight=ocp.set_weight,
             allowed=BACK_OFF,
         )
         size = self._library.nmpc_size(ctypes.byref(options), ctypes.byref(self._model))

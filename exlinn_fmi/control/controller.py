@@ -74,10 +74,12 @@ class _Memory:
         fallbacks: how often a fallback was needed so far.
         cost: last cost.
         stage: its first term.
-        P: terminal weight of the last solve.
+        P: terminal weight of the last solve, without that factor.
         error: state less reference that it expects at the coming tick.
         kkt: last KKT residual.
         slack: last violation of a state bound.
+        end: last terminal cost, without what it is multiplied by for the terminal set.
+        level: α of that set.
     """
 
     time: float = 0.0
@@ -94,6 +96,8 @@ class _Memory:
     error: NDArray[np.float64] | None = None
     kkt: float = 0.0
     slack: float = 0.0
+    end: float = 0.0
+    level: float = 0.0
 
 
 class NmpcController(Component):
@@ -103,7 +107,7 @@ class NmpcController(Component):
     and states of the reference, estimated state and disturbances, cost with its first term and what it may
     have grown by a disturbance, status (0 solved, 1 iteration limit, 2 failed: fallback applied), missing
     measurements, iterations, KKT residual, time taken [s], fallbacks so far, largest violation of a softened
-    bound over its range.
+    bound over its range; with a terminal set, cost of the plan's end and the level that bounds it there.
 
     Args:
         name: name in the scenario.
@@ -343,14 +347,16 @@ class NmpcController(Component):
         """What follows a solution."""
         plan = Plan(*self._ocp.shift(solution.x, solution.u, references.force))
         stats, targets = solution.stats, solution.targets
-        stage, P = 0.0, None
+        stage, end, level, P = 0.0, 0.0, 0.0, None
         if targets is not None:
             stage = self._ocp.weigh(
                 np.vstack([solution.x[0] - targets.x[0], np.zeros(self._ocp.n)]),
                 solution.u[:1] - targets.u[:1],
                 targets.P,
             )
-            P = targets.P
+            P, level = targets.P / targets.weight, targets.level
+            off = solution.x[-1] - targets.x[-1]
+            end = float(off @ P @ off)
         return replace(
             memory,
             plan=plan,
@@ -361,6 +367,8 @@ class NmpcController(Component):
             error=plan.x[0] - references.x[1],
             kkt=stats.kkt,
             slack=stats.slack,
+            end=end,
+            level=level,
         )
 
     def _fall_back(self, memory: _Memory, references: References) -> tuple[NDArray[np.float64], _Memory, str]:
@@ -395,5 +403,6 @@ class NmpcController(Component):
                 [following.cost, following.stage, change],
                 [float(solution.status), float(missing), float(solution.stats.iterations)],
                 [following.kkt, seconds, float(following.fallbacks), following.slack],
+                [following.end, following.level][: 2 * bool(self._ocp.set_weight)],
             ]
         )

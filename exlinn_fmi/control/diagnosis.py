@@ -36,11 +36,21 @@ def diagnose(
             f"the model's mass matrix is not positive definite at the start of the reference (eigenvalue "
             f"{smallest:.3g}): predictions may diverge; train again, with other data or `preset: structured`"
         )
-    if ocp.terminal == "dare" and not ocp.targets(references).riccati:
+    targets = ocp.targets(references)
+    if ocp.terminal == "dare" and not targets.riccati:
         found.append(
             "the Riccati equation has no solution at the reference: "
             f"the terminal cost is {FALLBACK_TERMINAL:g} Q"
+            + ", without a terminal set"
+            * bool(ocp.set_weight)
         )
+    elif ocp.set_weight and targets.level == 0.0:
+        found.append(
+            "terminal_set: there is none at the start of the reference, which lies on a bound there; "
+            "leave room between `reference` and `inputs`, `states`"
+        )
+    if ocp.set_weight and ocp.limits.rated:
+        found.append("terminal_set: the set knows nothing of `rates`")
     horizon = ocp.horizon * ocp.step
     slowest = response_time(ocp.system, at_rest(ocp.system, x), u, horizon)
     if slowest is not None and slowest > horizon:

@@ -177,7 +177,7 @@ def _forces(system: LagrangianSystem, q: Symbol, v: Symbol, a: Symbol, f: Symbol
 def _state(system: LagrangianSystem, q: Symbol, v: Symbol) -> Symbol:
     """The state column of positions and velocities."""
     kept = [i for i, c in enumerate(system.coordinates) if c.topology != "cyclic"]
-    return ca.vertcat(q[kept], v)
+    return ca.vertcat(*(q[i] for i in kept), v)  # `q[[]]` would be all of q
 
 
 def _completion(y: Symbol, z: Symbol, f: Symbol, x: Symbol, u: Symbol) -> ca.Function:

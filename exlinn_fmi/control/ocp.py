@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from exlinn_fmi.control.batch import Batch
 from exlinn_fmi.control.reference import References
 from exlinn_fmi.control.riccati import solve_dare
+from exlinn_fmi.control.terminal import terminal_level
 from exlinn_fmi.errors import ModelError, nearest
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.scenario.control import Nmpc
@@ -57,9 +58,11 @@ class Targets:
         x: reference states x*, shape (N + 1, n), within the state bounds.
         u: reference inputs, shape (N, m): u* within the input bounds, or 0.
         P: terminal weight, shape (n, n).
-        riccati: whether P solves the Riccati equation.
+        riccati: whether P / weight solves the Riccati equation.
         force: constant generalised force on each coordinate besides the inputs, shape (coordinates,).
         applied: the input applied last, shape (m,), None where there is none or where rates are not bounded.
+        weight: λ, what P was multiplied by so that plans end in the terminal set.
+        level: α of the terminal set for P / weight; 0 where there is none.
     """
 
     x: NDArray[np.float64]
@@ -68,6 +71,8 @@ class Targets:
     riccati: bool
     force: NDArray[np.float64]
     applied: NDArray[np.float64] | None = None
+    weight: float = 1.0
+    level: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -123,7 +128,8 @@ class Ocp:
         referenced: indices of the referenced states.
 
     Raises:
-        ModelError: names in `options` that the model does not have, or bounds that exclude each other.
+        ModelError: names in `options` that the model does not have, bounds that exclude each other, or a
+            terminal set that nothing is known of.
     """
 
     def __init__(
@@ -144,6 +150,10 @@ class Ocp:
         self.Q = np.diag(_numbers("weights.states", q, system.state_names, chosen))
         self.R = np.diag(_numbers("weights.inputs", r, system.input_names, np.ones(self.m)))
         self.terminal = weights.terminal
+        self.set_weight = 0.0 if options.terminal_set is None else options.terminal_set.weight
+        """λ, what the terminal cost is multiplied by so that plans end in the terminal set; 0: no set."""
+        if self.set_weight and (self.paper or self.terminal != "dare"):
+            raise ModelError("terminal_set: needs `cost: tracking` and `weights.terminal: dare`")
         self.limits = _limits(options, system, step)
         largest = max(self.Q.max(), self.R.max())
         self.l1 = PENALTY * largest * self.limits.span
@@ -209,7 +219,7 @@ class Ocp:
         A reference beyond a bound would pull against it with a force that grows without limit; within it, the
         bound's penalty stays exact.
         """
-        x, lim = references.x.copy(), self.limits
+        x, lim, factor, level = references.x.copy(), self.limits, 1.0, 0.0
         x[:, lim.soft] = np.clip(x[:, lim.soft], lim.x_min, lim.x_max)
         u = np.clip(references.u, lim.u_min, lim.u_max)
         P: NDArray[np.float64] | None = None
@@ -218,9 +228,15 @@ class Ocp:
             # An input without weight would leave R singular.
             R = self.R + np.diag(np.where(np.diagonal(self.R) > 0.0, 0.0, 1e-12 * max(1.0, self.Q.max())))
             P = solve_dare(A, B, self.Q, R)
-        factor = FALLBACK_TERMINAL if self.terminal == "dare" else self.terminal
+            if P is not None and self.set_weight:
+                u_room = np.minimum(lim.u_max - u[-1], u[-1] - lim.u_min)
+                x_room = np.minimum(lim.x_max - x[-1, lim.soft], x[-1, lim.soft] - lim.x_min)
+                level = terminal_level(A, B, R, P, u_room, lim.soft, x_room)
+                factor = self.set_weight
+        multiple = FALLBACK_TERMINAL if self.terminal == "dare" else self.terminal
         target = np.zeros_like(u) if self.paper else u
-        return Targets(x, target, factor * self.Q if P is None else P, P is not None, references.force)
+        end = multiple * self.Q if P is None else factor * P
+        return Targets(x, target, end, P is not None, references.force, weight=factor, level=level)
 
     def cost(
         self, x: Float[np.ndarray, "nodes n"], u: Float[np.ndarray, "intervals m"], targets: Targets

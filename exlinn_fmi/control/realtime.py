@@ -107,5 +107,7 @@ class CompiledGaussNewton(Solver):
             kernel.P_end.copy(),
             bool(head.riccati),
             references.force,
+            weight=self.ocp.set_weight if head.riccati and self.ocp.set_weight else 1.0,
+            level=head.level,
         )
         return Solution(kernel.x.copy(), kernel.u.copy(), status, stats, targets)

@@ -176,13 +176,25 @@ def _sizes(
         f".{name} = {getattr(kernel.head, name)!r}"
         for name in (entry[0] for entry in Head._fields_)
         if name
-        not in ("status", "reason", "iterations", "rounds", "method", "riccati", "kkt", "cost", "slack")
+        not in (
+            "status",
+            "reason",
+            "iterations",
+            "rounds",
+            "method",
+            "riccati",
+            "level",
+            "kkt",
+            "cost",
+            "slack",
+        )
     )
     return (
         "/* As many lanes as every processor has: the solver's memory is laid out for no more. */\n"
         "#if defined(__GNUC__)\n#define LANES 2\n#endif\n"
         '#define NMPC_API static\n#include "nmpc.h"\n\n'
-        f"#define KALMAN {int(kalman)}\n#define SLOW {int(parts.slow)}\n#define PI 3.141592653589793\n"
+        f"#define KALMAN {int(kalman)}\n#define TERMINAL_SET {int(ocp.set_weight > 0.0)}\n"
+        f"#define SLOW {int(parts.slow)}\n#define PI 3.141592653589793\n"
         f"{_enum(sizes)}\nstatic const double SAMPLE = {parts.step!r}, SAME_TIME = {SAME_TIME!r};\n"
         f"static const nmpc HEAD_START = {{{head}}};\n\n"
     )

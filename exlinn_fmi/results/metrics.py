@@ -29,6 +29,8 @@ DIAGNOSTICS = (
     "solve_time",
     "fallbacks",
     "slack",
+    "terminal_cost",
+    "terminal_level",
 )
 FAMILIES = ("reference_", "estimate_", "disturbance_")
 """Outputs of a controller that are not inputs of the plant: their names, and how others begin."""
@@ -281,6 +283,8 @@ def _effort(frame: pd.DataFrame, loop: Loop) -> dict[str, float]:
         metrics["fallbacks"] = float(fallbacks[-1])
     if (missing := recorded("missing")).size and missing.any():
         metrics["missing_measurements"] = float(missing.sum())
+    if (end := recorded("terminal_cost")).size and (level := recorded("terminal_level")).size == end.size:
+        metrics["terminal_inside"] = float(np.mean(end <= level))
     for output in ("iterations", "cost"):
         if (values := recorded(output)).size:
             metrics[f"{output}_mean"] = float(np.mean(values))

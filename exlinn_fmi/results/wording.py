@@ -46,6 +46,7 @@ WORDING = (
     (r"control\.deadline_misses", "Solves that took longer than the sampling time", ""),
     (r"control\.missing_measurements", "Measurements that were no number, and were predicted", ""),
     (r"control\.decrease", "Samples at which the cost fell as a Lyapunov function must", ""),
+    (r"control\.terminal_inside", "Samples whose plan ended in the terminal set", ""),
     (r"control\.fallbacks", "Steps that fell back to the previous plan", ""),
     (r"control\.iterations_mean", "Solver iterations a step, mean", ""),
     (r"control\.cost_mean", "Cost J, mean", ""),

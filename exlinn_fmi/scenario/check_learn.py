@@ -306,9 +306,12 @@ def _controller(
         high = math.inf if limits.max is None else limits.max
         if not low <= value <= high:
             yield (*at, "safe_input", name), f"expected {low:g} … {high:g} (its bounds), found {value:g}"
+    weights = nmpc.weights
+    if nmpc.terminal_set and (nmpc.cost == "paper" or weights.terminal != "dare"):
+        found = "`cost: paper`" if nmpc.cost == "paper" else f"`weights.terminal: {weights.terminal:g}`"
+        yield (*at, "terminal_set"), f"needs `cost: tracking` and `weights.terminal: dare`, found {found}"
     if states is None or inputs is None:
         return
-    weights = nmpc.weights
     yield from _unknown((*at, "states"), nmpc.states, states, "states")
     yield from _unknown((*at, "inputs"), nmpc.inputs, inputs, "inputs")
     yield from _unknown((*at, "safe_input"), nmpc.safe_input, inputs, "inputs")

@@ -66,6 +66,12 @@ class Weights(Spec):
     ] = Field("dare", description="terminal cost: the Riccati solution at the reference, or a multiple of Q")
 
 
+class TerminalSet(Spec):
+    """Set about the reference in which plans should end, by a heavier terminal cost (Limon et al. 2006)."""
+
+    weight: float = Field(10.0, ge=1, description="λ, what the terminal cost is multiplied by")
+
+
 Disturbances = Annotated[
     Annotated[list[str], Tag("a list")] | Annotated[dict[str, Positive], Tag("a mapping")],
     Discriminator(form),
@@ -130,6 +136,11 @@ class Nmpc(Spec):
         "`paper`: Σ‖x_ref−x‖²_Q + ‖u‖²_R, eq. (13)",
     )
     weights: Weights = Field(default_factory=lambda: Weights(), description="Q, R and the terminal cost")
+    terminal_set: TerminalSet | None = Field(
+        None,
+        description="plans should end where the linear feedback of the Riccati equation keeps all bounds: "
+        "`{}` or `{weight: 10}`; for short horizons. Needs `cost: tracking` and `weights.terminal: dare`",
+    )
     inputs: dict[str, Bounds] = Field(default_factory=dict, description="bounds on inputs, by name")
     states: dict[str, Bounds] = Field(
         default_factory=dict, description="bounds on states, by name (softened)"

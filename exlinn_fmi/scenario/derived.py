@@ -16,6 +16,12 @@ from exlinn_fmi.scenario.schema import (
 )
 from exlinn_fmi.scenario.signals import MEASURED, Channel
 
+TERMINAL = {
+    "terminal_cost": "cost of the plan's end by the Riccati equation",
+    "terminal_level": "largest such cost within the terminal set, 0 where there is none",
+}
+"""What a controller with a terminal set tells besides."""
+
 
 def derived_variables(spec: ComponentBase, learned: Sequence[Coordinate]) -> tuple[Variable, ...] | None:
     """Variables of a component that need no look at anything outside the scenario; None where they do.
@@ -110,6 +116,11 @@ def nmpc_variables(coordinates: tuple[Coordinate, ...], options: Nmpc) -> tuple[
         output("solve_time", "s", "time that reference and solve took"),
         output("fallbacks", "1", "fallbacks so far", "Integer"),
         output("slack", "1", "largest violation of a state bound in the plan, over the bound's range"),
+        *(
+            []
+            if options.terminal_set is None
+            else [output(name, "1", text) for name, text in TERMINAL.items()]
+        ),
     )
 
 

@@ -56,6 +56,7 @@ CASES: dict[str, dict[str, Any]] = {
         "reference": follow("prbs", amplitude=0.2, hold=0.15, order=4, offset=1.0),
     },
     "several sines": {"reference": follow("multisine", rms=0.2, band=[0.5, 2.0], lines=5, offset=1.0)},
+    "a terminal set": {"terminal_set": {"weight": 20}, "horizon": 10, "solver": "sqp"},
 }
 
 

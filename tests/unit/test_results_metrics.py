@@ -131,6 +131,17 @@ def test_a_cost_that_falls_by_less_is_counted_unless_a_disturbance_explains_it(f
     assert control_metrics(disturbed, scenario(), UNITS)["control.decrease"] == 1.0
 
 
+def test_the_share_of_plans_that_end_in_the_terminal_set_is_told_where_there_is_one(
+    frame: pd.DataFrame,
+) -> None:
+    assert "control.terminal_inside" not in control_metrics(frame, scenario(), UNITS)
+    ends = np.repeat([3.0, 2.0, 1.0, 0.0], 10)
+    rows = frame.iloc[: len(ends)].assign(
+        **{"controller.terminal_cost": ends, "controller.terminal_level": 1.0}
+    )
+    assert control_metrics(rows, scenario(), UNITS)["control.terminal_inside"] == 0.5
+
+
 def test_solves_longer_than_the_sampling_time_miss_their_deadline(frame: pd.DataFrame) -> None:
     late = frame.copy()
     late.loc[20:49, "controller.solve_time"] = 0.011  # three samples

@@ -335,6 +335,13 @@ def test_a_learned_model_has_the_variables_of_its_coordinates(tmp_path):
         ("inputs: 1e-3", "inputs: {w: 1}", "weights.inputs.w", "the model has no input 'w'"),
         ("safe_input: {v: 0}", "safe_input: {w: 0}", "safe_input.w", "the model has no input 'w'"),
         ("safe_input: {v: 0}", "safe_input: {v: 30}", "safe_input.v", "expected -24 … 24 (its bounds)"),
+        (
+            "safe_input: {v: 0}",
+            "cost: paper\n      terminal_set: {}",
+            "terminal_set",
+            "needs `cost: tracking` and `weights.terminal: dare`, found `cost: paper`",
+        ),
+        ("terminal: dare}", "terminal: 2}\n      terminal_set: {}", "terminal_set", "terminal: 2`"),
         ("coordinate: alpha", "coordinate: alhpa", "reference.coordinate", "did you mean 'alpha'?"),
         ("{map: scotch_yoke, crank: 0.2}", "~", "reference.trajectory", "trajectory [m] → alpha [rad]"),
         ("{signal: sine, amplitude: 0.15, frequency: 0.4, unit: m}",

@@ -46,6 +46,8 @@ typedef struct {
     long long method;                            /* that solved it: 1 active set, 2 interior point */
     long long riccati;                           /* 1: the terminal cost does solve its equation */
     double step, tolerance, terminal;
+    double set_weight; /* factor of the terminal cost that makes plans end in the terminal set; 0: there is none */
+    double level;      /* result: of the terminal set */
     double kkt, cost, slack;
     double allowed;   /* violation of a bound that is not reported, over its span */
     long long extend; /* 1: the plan's last state is still to be predicted */

@@ -6,6 +6,7 @@
 
 #include "interior.h"
 #include "network.h"
+#include "terminal.h"
 
 #define FALLBACK_TERMINAL 10.0
 #define SPREAD 1e8 /* of the curvatures of two states up to which the model's own units do */
@@ -63,7 +64,7 @@ static size_t lay_out(problem *p, nmpc *head, const nmpc_model *model, const cha
         lanes = LANES * (interval_scratch(&p->net) + n + m + n + n * (n + m));
     } else
         lanes = (size_t)(model->work + model->integer_work) + n * (n + m + 1);
-    size_t dare = dare_scratch((int)n, (int)m) + n * n + m * m;
+    size_t dare = dare_scratch((int)n, (int)m) + n * n + m * m + m + s + terminal_scratch((int)n, (int)m);
     return at + padded(lanes > dare ? lanes : dare);
 }
 
@@ -168,11 +169,21 @@ static void bound_references(problem *p) {
     }
 }
 
+/* How far the reference's end is from its bounds: the inputs (m), then the softened states (s). */
+static void find_room(const problem *p, double *room) {
+    const double *x = p->x_to + p->N * p->n;
+    for (int i = 0; i < p->m; ++i) room[i] = smaller(p->u_max[i] - p->u_end[i], p->u_end[i] - p->u_min[i]);
+    for (int b = 0; b < p->s; ++b) {
+        double at = x[p->q.soft[b]];
+        room[p->m + b] = smaller(p->x_max[b] - at, at - p->x_min[b]);
+    }
+}
+
 /* The terminal cost at the reference's end, which has been linearised. */
 static void terminal_cost(problem *p) {
     const int n = p->n, m = p->m;
     double factor = p->head->terminal;
-    p->head->riccati = 0;
+    p->head->riccati = 0, p->head->level = 0.0;
     if (p->head->dare) {
         double *A = p->scratch, *R = A + n * n;
         memcpy(A, p->A_end, sizeof(double) * (size_t)(n * n));
@@ -181,6 +192,12 @@ static void terminal_cost(problem *p) {
         p->head->riccati = all_finite(A, n * n) && all_finite(p->B_end, n * m) &&
                            solve_dare(n, m, A, p->B_end, p->Q, R, p->P_end, R + m * m);
         factor = FALLBACK_TERMINAL;
+        if (p->head->riccati && p->head->set_weight > 0.0) {
+            double *room = R + m * m, *rest = room + m + p->s;
+            find_room(p, room);
+            p->head->level = terminal_level(n, m, p->s, p->A_end, p->B_end, R, p->P_end, room, p->q.soft, room + m, rest);
+            for (int i = 0; i < n * n; ++i) p->P_end[i] *= p->head->set_weight;
+        }
     }
     if (!p->head->riccati)
         for (int i = 0; i < n * n; ++i) p->P_end[i] = factor * p->Q[i];

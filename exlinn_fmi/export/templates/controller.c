@@ -16,7 +16,7 @@ enum {
     M_U = FIRST_Y, /* outputs, one behind the other */
     M_QUANTITY = M_U + N_U, M_REFERENCE = M_QUANTITY + N_REFERENCED, M_ESTIMATE = M_REFERENCE + N_X,
     M_DISTURBANCE = M_ESTIMATE + N_X, M_COST = M_DISTURBANCE + N_Q, M_STAGE, M_CHANGE, M_STATUS, M_MISSING,
-    M_ITERATIONS, M_KKT, M_FALLBACKS, M_SLACK
+    M_ITERATIONS, M_KKT, M_FALLBACKS, M_SLACK, M_END, M_LEVEL /* the last two with a terminal set */
 };
 enum { SMOOTHNESS = 0 };
 enum { N_Z = N_X + N_D, GRID = 2 * HORIZON + 1, ORDERS_1 = 5, N_MOTION = N_REFERENCED * ORDERS_1, REACH = 8 };
@@ -42,7 +42,7 @@ typedef struct {
     double applied[N_U];
     int weighed;
     double error[N_X]; /* state less reference that is expected at the coming tick */
-    double P[N_X][N_X], cost, stage, kkt, slack;
+    double P[N_X][N_X], cost, stage, kkt, slack, end, level;
     double fallbacks;
 } Memory;
 
@@ -688,7 +688,14 @@ static void tick(State *s)
         f->planned = 1, f->left = HORIZON - 1;
         f->cost = head->cost, f->kkt = head->kkt, f->slack = head->slack;
         f->stage = form_of(Q_WEIGHT, ex, N_X) + form_of(R_WEIGHT, eu, N_U);
-        memcpy(f->P, array(s, "P_end"), sizeof f->P), f->weighed = 1;
+        const double *weight = array(s, "P_end"), factor = head->riccati && TERMINAL_SET ? head->set_weight : 1.0;
+        for (int i = 0; i < N_X; i++) {
+            for (int j = 0; j < N_X; j++) {
+                f->P[i][j] = weight[i * N_X + j] / factor;
+            }
+            ex[i] = plan_x[HORIZON * N_X + i] - array(s, "x_to")[HORIZON * N_X + i];
+        }
+        f->weighed = 1, f->end = form_of(&f->P[0][0], ex, N_X), f->level = head->level;
         for (int i = 0; i < N_X; i++) {
             f->error[i] = f->plan_x[0][i] - f->reference.x[2][i];
         }
@@ -731,6 +738,9 @@ static void tick(State *s)
     values[M_STATUS] = (double)head->status, values[M_MISSING] = missing(y);
     values[M_ITERATIONS] = (double)head->iterations, values[M_KKT] = f->kkt;
     values[M_FALLBACKS] = f->fallbacks, values[M_SLACK] = f->slack;
+#if TERMINAL_SET
+    values[M_END] = f->end, values[M_LEVEL] = f->level;
+#endif
 
     if (known && !LATE) { /* what is measured at the next tick belongs to that tick */
         predict(mean, P, u);
