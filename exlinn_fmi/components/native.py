@@ -7,7 +7,7 @@ argument lists given here, which are those of FMI 2.0 and 3.0.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -65,6 +65,25 @@ class NativeStep:
     pointers: tuple[int, ...] = ()
 
 
+@dataclass(frozen=True)
+class Change:
+    """What a component does to a value on its way, in the vector that the master has.
+
+    Args:
+        position: of the value among those set or got.
+        kind: ``set`` to the number, ``add`` it, ``scale`` by it, or ``hold``: the number is the value
+            that was kept last.
+        number: (1,) see `kind`.
+        state: what is done at a communication point [s]: ``on``, ``off``, or ``keep`` the value in `number`;
+            None where it is always on.
+    """
+
+    position: int
+    kind: Literal["set", "add", "scale", "hold"]
+    number: NDArray[np.float64]
+    state: Callable[[float], Literal["on", "off", "keep"]] | None = None
+
+
 class Native(ABC):
     """What a component offers for compiled stepping.
 
@@ -86,3 +105,7 @@ class Native(ABC):
             function: `NativeAccess.name`, or ``DoStep``; this one also if its end or early flag was set.
             code: what it returned.
         """
+
+    def changes(self, verb: Literal["Get", "Set"], indices: Indices) -> Sequence[Change]:
+        """What becomes of values of the variables at `indices`, before `Set` or after `Get`, in order."""
+        return ()

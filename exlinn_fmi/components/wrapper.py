@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Literal
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values
+from exlinn_fmi.components.native import Change, Native, NativeAccess
 
 
 class Wrapper(Component):
@@ -79,3 +81,26 @@ class Wrapper(Component):
     def close(self) -> None:
         """Close the inner component."""
         self.inner.close()
+
+
+class WrapperNative(Native):
+    """The C functions of a component within a wrapper.
+
+    Args:
+        inner: its own.
+    """
+
+    def __init__(self, inner: Native) -> None:
+        self.inner, self.step = inner, inner.step
+
+    def access(self, verb: Literal["Get", "Set"], indices: Indices) -> Sequence[NativeAccess]:
+        """As the inner component."""
+        return self.inner.access(verb, indices)
+
+    def heed(self, function: str, code: int) -> Status:
+        """As the inner component."""
+        return self.inner.heed(function, code)
+
+    def changes(self, verb: Literal["Get", "Set"], indices: Indices) -> Sequence[Change]:
+        """As the inner component."""
+        return self.inner.changes(verb, indices)

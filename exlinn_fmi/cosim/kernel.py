@@ -45,8 +45,9 @@ ARGUMENTS = 11
 DONE, CALL, STATUS, REFUSED, INFINITE = range(5)
 REASONS = 8
 
-# Kinds of moves between memory cells: as they are, from float64 to a type, from a type to float64.
-FROM = 16
+# Kinds of moves between memory cells: as they are, from float64 to a type, from a type to float64; or what is
+# in the target is scaled by what is read, or that added to it.
+FROM, SCALE, ADD = 16, 14, 15
 TYPES = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "truth1", "truth4")
 F8, F4, I1, U1, I2, U2, I4, U4, I8, U8, B1, B4 = range(12)
 
@@ -197,6 +198,10 @@ def _move(moves: Any, first: int, last: int) -> bool:  # pragma: no cover - comp
             _put_f8(target, _get_f8(source))
         elif kind >= FROM:
             _put_f8(target, _load(kind - FROM, source))
+        elif kind == SCALE:
+            _put_f8(target, _get_f8(target) * _get_f8(source))
+        elif kind == ADD:
+            _put_f8(target, _get_f8(target) + _get_f8(source))
         elif not _store(kind, _get_f8(source), target):
             return False
     return True

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from exlinn_fmi.components.base import Values
-from exlinn_fmi.components.native import Native, NativeAccess
+from exlinn_fmi.components.native import Change, Native, NativeAccess
 from exlinn_fmi.cosim import kernel as k
 from exlinn_fmi.cosim.exchange import Advance, Exchange
 from exlinn_fmi.cosim.plan import Plan
@@ -130,6 +130,15 @@ class Program:
         self._moves += moves
         return first
 
+    def _add_changes(self, changes: Sequence[Change], piece: Values) -> None:
+        """Moves that do to values in a piece of the vector what a component does to them."""
+        kinds = {"set": k.F8, "add": k.ADD, "scale": k.SCALE}
+        for change in changes:
+            self._kept.append(change.number)
+            self._add_moves(
+                [(kinds[change.kind], _address(change.number), _address(piece[change.position :]))]
+            )
+
     def _add_step(self, a: Advance) -> None:
         """A step, with its exchanges before and after in Gauss–Seidel."""
         native, due = self._natives[a.component], {k.EVERY: a.every, k.SPAN: a.every}
@@ -164,6 +173,8 @@ class Program:
             sources = vector.ctypes.data + 8 * x.sources
             given = zip(sources.tolist(), _addresses(x.given), strict=True)
             self._add_moves((k.F8, a, b) for a, b in given)
+            if native is not None:
+                self._add_changes(native.changes("Set", x.inputs), x.given)
         check = {k.CHECK: _address(x.taken), k.CHECKED: len(x.taken)}
         if native is None:
             act = Act(call=lambda tick: self._plan.trade(x, self._time(tick)))
@@ -192,6 +203,8 @@ class Program:
                     out = _addresses(values, call.elements)
                     cells = zip(out, _addresses(x.taken, call.positions), strict=True)
                     self._add_moves((kind + k.FROM, a, b) for a, b in cells)
+                if n == len(calls):
+                    self._add_changes(native.changes("Get", x.outputs), x.taken)
                 columns = {**who, **_arguments(call, values), k.FIRST: first, k.LAST: len(self._moves)}
                 if n == len(calls):
                     columns |= check

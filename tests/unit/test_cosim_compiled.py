@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from exlinn_fmi.components.base import Component
 from exlinn_fmi.components.fmu import FmuComponent
+from exlinn_fmi.components.links import Converted
 from exlinn_fmi.components.signals import SignalSource
 from exlinn_fmi.cosim.graph import Graph, _fits
 from exlinn_fmi.cosim.master import Master, Trajectories
@@ -65,8 +66,8 @@ def both(
 
 
 @st.composite
-def graphs(draw: st.DrawFn) -> tuple[list[str], list[int], list[tuple[int, int, int, int]], dict]:
-    """Kinds of components, own steps, connections as numbers to be wrapped, and options of the master."""
+def graphs(draw: st.DrawFn) -> tuple[list[str], list[int], list[tuple[int, int, int, int]], dict, dict]:
+    """Kinds of components, own steps, connections as numbers to be wrapped, conversions, options."""
     kinds = draw(st.lists(st.sampled_from(["fmu2", "fmu3", "lag", "gain", "signal"]), min_size=1, max_size=5))
     kinds[draw(st.integers(0, len(kinds) - 1))] = draw(st.sampled_from(["fmu2", "fmu3"]))
     every = draw(st.lists(st.sampled_from([1, 1, 1, 2, 3]), min_size=len(kinds), max_size=len(kinds)))
@@ -77,13 +78,17 @@ def graphs(draw: st.DrawFn) -> tuple[list[str], list[int], list[tuple[int, int, 
         "record_every": draw(st.sampled_from([1, 1, 4])),
         "profile": draw(st.booleans()),
     }
-    return kinds, every, wires, options
+    number = st.sampled_from([1.0, -0.0, 0.0, 0.1, -3.0, 1e-300, 1e300])
+    conversions = draw(
+        st.dictionaries(st.integers(0, 4), st.dictionaries(st.integers(0, 9), st.tuples(number, number)))
+    )
+    return kinds, every, wires, conversions, options
 
 
 @given(graphs(), st.integers(0, len(SIGNALS) - 1))
 @settings(max_examples=60, deadline=None)
 def test_any_graph_is_stepped_alike(probes: dict[int, Path], drawn: tuple, signal: int):
-    kinds, every, wires, options = drawn
+    kinds, every, wires, conversions, options = drawn
 
     def make() -> list[Component]:
         makers: dict[str, Callable[[str], Component]] = {
@@ -93,7 +98,16 @@ def test_any_graph_is_stepped_alike(probes: dict[int, Path], drawn: tuple, signa
             "gain": lambda name: Gain(name, -0.7, 0.2, sampled=True),
             "signal": lambda name: SignalSource(name, SIGNALS[signal], probes[2].parent.parent),
         }
-        return [makers[kind](f"c{k}") for k, kind in enumerate(kinds)]
+        made = [makers[kind](f"c{k}") for k, kind in enumerate(kinds)]
+        return [Converted(c, reals(c, conversions[k])) if k in conversions else c for k, c in enumerate(made)]
+
+    def reals(component: Component, found: dict) -> dict:
+        """Whole numbers would be refused before the first step."""
+        return {
+            k: v
+            for k, v in found.items()
+            if k < len(component.variables) and component.variables[k].type == "Real"
+        }
 
     components = make()
     ports = {
@@ -114,6 +128,47 @@ def test_any_graph_is_stepped_alike(probes: dict[int, Path], drawn: tuple, signa
     own_steps = {f"c{k}": 0.01 * n for k, n in enumerate(every)}
     pairs = [(source, target) for target, source in connections.items()]
     both(make, pairs, own_steps=own_steps, stop=0.5, **options)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_converted_component_is_stepped_in_compiled_code(probes: dict[int, Path], version: int):
+    def make() -> list[Component]:
+        source, target = (FmuComponent(name, probes[version]) for name in ("a", "b"))
+        conversions = dict(
+            zip(map(target.index, names), [(1 / 3, -0.1), (2.0, 1.0), (-1.0, 1.0)], strict=True)
+        )
+        return [source, Converted(target, conversions)]
+
+    number, truth = (
+        (["n_in", "n_out"], ["on", "off"])
+        if version == 2
+        else ([f"{kind}_in", f"{kind}_out"] for kind in ("Int16", "Boolean"))
+    )
+    names = ["u", number[0], truth[0]]
+    pairs = [
+        ("a.y", "b.u"),
+        ("b.y", "a.u"),
+        (f"a.{number[1]}", f"b.{number[0]}"),
+        (f"a.{truth[1]}", f"b.{truth[0]}"),
+    ]
+    for algorithm in ("jacobi", "gauss-seidel"):
+        components = make()
+        assert all(component.native() is not None for component in components)
+        for component in components:
+            component.close()
+        plain, _ = both(make, pairs, algorithm=algorithm)
+        assert plain.error is None
+        y, u = (plain.frame[name].to_numpy() for name in ("a.y", "b.u"))
+        assert (u == y * (1 / 3) + -0.1).all()
+
+
+def test_what_a_conversion_makes_of_a_value_is_refused_alike(probes: dict[int, Path]):
+    def make() -> list[Component]:
+        target = FmuComponent("b", probes[2])
+        return [FmuComponent("c", probes[2]), Converted(target, {target.index("n_in"): (0.5, 0.5)})]
+
+    plain, _ = both(make, [("c.n_out", "b.n_in"), ("b.n_out", "c.n_in")])
+    assert "n_in is of type Integer: cannot be 2.5" in str(plain.error)
 
 
 def test_a_plant_of_ours_under_a_python_controller_is_stepped_alike():
