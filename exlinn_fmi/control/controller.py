@@ -5,9 +5,10 @@ very tick, unless `delay: computation` has them answer those of the tick before.
 output is first read, and again only if a measurement is changed before the step; `step` keeps the result as
 what the next tick starts from.
 
-A measurement that is not finite is replaced by what the estimator expects. Where a solve fails the previous
-plan goes on, shifted, as long as it has inputs left; then `safe_input` is applied. All this is counted and
-reported, and no output is ever NaN or out of bounds.
+A measurement that is missing is replaced by what the estimator expects, until `dropout.timeout`. Where a
+solve fails the previous plan goes on, shifted, as long as it has inputs left; then, or where measurements are
+missing for longer, `safe_input` is applied. All this is counted and reported, and no output is ever NaN or
+out of bounds.
 """
 
 from __future__ import annotations
@@ -24,10 +25,11 @@ from exlinn_fmi.components.base import Component, Indices, Status, Values
 from exlinn_fmi.components.packing import pack, unpack
 from exlinn_fmi.control.defaults import completed, estimator, measure, refined
 from exlinn_fmi.control.diagnosis import diagnose
+from exlinn_fmi.control.dropout import Heard, Listener
 from exlinn_fmi.control.estimator import Belief, Estimator, Sample
 from exlinn_fmi.control.ocp import HORIZON, Ocp, check_names
 from exlinn_fmi.control.reference import ReferenceGenerator, References
-from exlinn_fmi.control.solver import Plan, Solution, Solver, SolveStatus, make_solver
+from exlinn_fmi.control.solver import Plan, Solution, Solver, SolveStatus, Stats, make_solver
 from exlinn_fmi.errors import InputError, ModelError, nearest
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.scenario.control import Nmpc
@@ -41,6 +43,7 @@ class Parts:
     Args:
         ocp: the optimal control problem.
         estimator: of state and disturbances.
+        listener: to measurements that may be missing.
         generator: of references.
         solver: of the problem.
         step: sampling time [s].
@@ -51,6 +54,7 @@ class Parts:
 
     ocp: Ocp
     estimator: Estimator
+    listener: Listener
     generator: ReferenceGenerator
     solver: Solver
     step: float
@@ -71,6 +75,7 @@ class _Memory:
         references: the last reference.
         belief: what is expected of the state that the coming measurements tell of, None where nothing is.
         applied: the last input that was found.
+        heard: what came of the measurements so far.
         fallbacks: how often a fallback was needed so far.
         cost: last cost.
         stage: its first term.
@@ -89,6 +94,7 @@ class _Memory:
     references: References | None = None
     belief: Belief | None = None
     applied: NDArray[np.float64] | None = None
+    heard: Heard | None = None
     fallbacks: int = 0
     cost: float = 0.0
     stage: float = 0.0
@@ -105,9 +111,10 @@ class NmpcController(Component):
 
     Inputs are the model's states, as measured. Outputs are its inputs, and how they came about: quantities
     and states of the reference, estimated state and disturbances, cost with its first term and what it may
-    have grown by a disturbance, status (0 solved, 1 iteration limit, 2 failed: fallback applied), missing
-    measurements, iterations, KKT residual, time taken [s], fallbacks so far, largest violation of a softened
-    bound over its range; with a terminal set, cost of the plan's end and the level that bounds it there.
+    have grown by a disturbance, status (0 solved, 1 iteration limit, 2 failed: fallback applied, 3 not solved
+    for measurements have been missing for too long: safe input applied), missing measurements, iterations,
+    KKT residual, time taken [s], fallbacks so far, largest violation of a softened bound over its range; with
+    a terminal set, cost of the plan's end and the level that bounds it there.
 
     Args:
         name: name in the scenario.
@@ -149,7 +156,7 @@ class NmpcController(Component):
             raise ModelError(f"components.{name}.nmpc.{error}") from None
         if self._ocp.horizon != sight:
             generator = ReferenceGenerator(system, options.reference, folder, step, self._ocp.horizon)
-        self._generator = generator
+        self._generator, self._listener = generator, Listener(self._estimator, options.dropout, step)
         self._late, self._slow = options.delay != "none", options.delay == "computation"
         self._solver = make_solver(
             self._ocp, options.solver, options.iterations, options.tolerance, options.backend
@@ -173,6 +180,7 @@ class NmpcController(Component):
         return Parts(
             self._ocp,
             self._estimator,
+            self._listener,
             self._generator,
             self._solver,
             self._step,
@@ -264,7 +272,7 @@ class NmpcController(Component):
 
     def deserialize_state(self, data: bytes) -> object:
         """A state from bytes."""
-        return unpack(data, (_Memory, Plan, References, Belief, Sample))
+        return unpack(data, (_Memory, Plan, References, Belief, Sample, Heard))
 
     def close(self) -> None:
         """Nothing to free."""
@@ -272,7 +280,8 @@ class NmpcController(Component):
     def _tick(self) -> Status:
         """One round of Algorithm 1 at the present tick."""
         begin, memory = perf_counter(), self._memory
-        now = self._believe(memory)
+        y, heard = self._listener.hear(memory.heard, memory.belief, self._measured)
+        now, missing, lost = self._believe(memory, y), self._missing(y), self._listener.lost(heard)
         ahead = now
         if now is not None and self._late and memory.applied is not None:
             ahead = self._estimator.predict(now, memory.applied)
@@ -281,12 +290,15 @@ class NmpcController(Component):
         branch = self._generator.branch(state) if memory.branch is None else memory.branch
         time = memory.time + (self._step if self._slow else 0.0)
         references = self._generator.over(time, state, branch, memory.references, force)
-        unknown = np.full(self._ocp.n, np.nan)
-        solution = self._solver.solve(
-            unknown if ahead is None else state, references, memory.plan, memory.applied
-        )
-        message = "; ".join(text for text in (self._missing(), solution.stats.message) if text)
-        if solution.status == SolveStatus.FAILED:
+        if lost.any():
+            memory, solution = replace(memory, plan=None), self._nothing(lost, references)
+        else:
+            unknown = np.full(self._ocp.n, np.nan)
+            solution = self._solver.solve(
+                unknown if ahead is None else state, references, memory.plan, memory.applied
+            )
+        message = "; ".join(text for text in (missing, solution.stats.message) if text)
+        if solution.status >= SolveStatus.FAILED:
             u, following, action = self._fall_back(memory, references)
             message = f"{message}; {action}"
         else:
@@ -305,32 +317,41 @@ class NmpcController(Component):
             references=references if ahead is not None else None,
             belief=belief,
             applied=u,
+            heard=heard,
         )
         applied = u if not self._slow else self._safe if memory.applied is None else memory.applied
         at_tick = ahead if not self._slow else now
         change = 0.0 if ahead is None else self._change(memory, state - references.x[0])
         self._write(applied, reported, at_tick, solution, change, perf_counter() - begin)
-        if solution.status == SolveStatus.SOLVED and not self._missing():
+        if solution.status == SolveStatus.SOLVED and not missing:
             return Status.OK
         self.message = f"t = {memory.time:.9g} s: {message}"
         return Status.WARNING
 
-    def _believe(self, memory: _Memory) -> Belief | None:
+    def _believe(self, memory: _Memory, y: NDArray[np.float64]) -> Belief | None:
         """What the measurements tell of the state at their time; None before all have come once."""
-        y = self._measured.copy()
         belief = None if memory.belief is None else self._estimator.update(memory.belief, y)
         if belief is not None and belief.finite:
             return belief
         # At first, or where the model led the estimate astray.
-        if self._missing():
+        if self._missing(y):
             return None
         return self._estimator.begin(y, self._starts)
 
-    def _missing(self) -> str:
-        """Which measurements are no numbers, in words."""
-        wrong = self._estimator.noise.measured & ~np.isfinite(self._measured)
-        names = [self.variables[k].name for k in np.flatnonzero(wrong)]
-        return f"measurement of {', '.join(names)} is not finite" if names else ""
+    def _missing(self, y: NDArray[np.float64]) -> str:
+        """Which measurements are missing, in words."""
+        wrong = self._estimator.noise.measured & ~np.isfinite(y)
+        words = {False: "not finite", True: "stale"}
+        return "; ".join(
+            f"measurement of {self.variables[k].name} is {words[bool(np.isfinite(self._measured[k]))]}"
+            for k in np.flatnonzero(wrong)
+        )
+
+    def _nothing(self, lost: NDArray[np.bool_], references: References) -> Solution:
+        """No solution, for these measurements have been missing for too long."""
+        names = ", ".join(self.variables[k].name for k in np.flatnonzero(lost))
+        text = f"no measurement of {names} for longer than dropout.timeout ({self._listener.timeout:g} s)"
+        return Solution(references.x, references.u, SolveStatus.LOST, Stats(message=text))
 
     def _change(self, memory: _Memory, error: NDArray[np.float64]) -> float:
         """Most that the cost may grow by the error's being off its prediction, by w.
@@ -392,7 +413,8 @@ class NmpcController(Component):
         """Fill the outputs, in the order of the variables."""
         following, estimator = self._following, self._estimator
         assert following is not None
-        missing = np.count_nonzero(estimator.noise.measured & ~np.isfinite(self._measured))
+        assert following.heard is not None
+        missing = np.count_nonzero(following.heard.silent)
         self._outputs = np.concatenate(
             [
                 u,

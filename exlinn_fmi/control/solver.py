@@ -28,11 +28,12 @@ from exlinn_fmi.errors import ExlinnError, SolverError
 
 
 class SolveStatus(IntEnum):
-    """Outcome of a solve."""
+    """Outcome of a solve; LOST: there was none, for measurements have been missing for too long."""
 
     SOLVED = 0
     LIMIT = 1
     FAILED = 2
+    LOST = 3
 
 
 @dataclass(frozen=True)

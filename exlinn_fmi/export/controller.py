@@ -171,6 +171,7 @@ def _sizes(
         "N_W": max(1, *(f.sz_w() for f in functions)),
         "LATE": parts.late,
         "STEADY": steady,
+        "STALE": parts.listener.stale or 0,
     }
     head = ", ".join(
         f".{name} = {getattr(kernel.head, name)!r}"
@@ -217,6 +218,7 @@ def _weights(controller: NmpcController) -> str:
         "PRICE": ocp.l1,
         "PRICE_2": ocp.l2,
         "SAFE": parts.safe,
+        "TIMEOUT": np.inf if parts.listener.timeout is None else parts.listener.timeout,
         "PARAMETERS": ocp.system.parameter_values,
     }
     return "".join(_doubles(k, v) for k, v in arrays.items()) + _integers("SOFT", list(lim.soft), "long long")

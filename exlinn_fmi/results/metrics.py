@@ -285,6 +285,8 @@ def _effort(frame: pd.DataFrame, loop: Loop) -> dict[str, float]:
         metrics["missing_measurements"] = float(missing.sum())
     if (end := recorded("terminal_cost")).size and (level := recorded("terminal_level")).size == end.size:
         metrics["terminal_inside"] = float(np.mean(end <= level))
+    if (lost := recorded("solve_status") == 3).any():
+        metrics["lost_samples"] = float(np.count_nonzero(lost))
     for output in ("iterations", "cost"):
         if (values := recorded(output)).size:
             metrics[f"{output}_mean"] = float(np.mean(values))

@@ -112,6 +112,22 @@ class Estimator(Spec):
     iterations: int = Field(2, ge=1, le=100, description="Gauss–Newton steps of `mhe` at each sample")
 
 
+class Dropout(Spec):
+    """What counts as a lost measurement, and for how long the model's prediction stands in for it."""
+
+    stale: int | None = Field(
+        None,
+        ge=1,
+        description="a measurement that has come again to the last bit so many times counts as missing while "
+        "the model expects a change beyond its noise: for sensors that hold their last value; else never",
+    )
+    timeout: Positive | None = Field(
+        None,
+        description="`safe_input` is applied while a measurement has been missing for longer than this [s]; "
+        "predicted for as long as it takes if not given",
+    )
+
+
 class Nmpc(Spec):
     """Nonlinear model predictive control around a learned model: eqs. (13), (14), Algorithm 1."""
 
@@ -176,6 +192,7 @@ class Nmpc(Spec):
         default_factory=dict,
         description="input to fall back to when there is no plan left, by name; 0 if not given",
     )
+    dropout: Dropout = Field(default_factory=lambda: Dropout(), description="measurements that are lost")
 
     @property
     def estimation(self) -> Estimator:

@@ -83,8 +83,10 @@ def networks() -> LagrangianSystem:
     return learned_system(spec, weights)
 
 
-def in_loop(controller: Any, system: LagrangianSystem, ticks: int, names: list[str]) -> np.ndarray:
-    """Outputs of a controller at each tick, in a closed loop with its own model."""
+def in_loop(
+    controller: Any, system: LagrangianSystem, ticks: int, names: list[str], stuck: range = range(0)
+) -> np.ndarray:
+    """Outputs of a controller at each tick, in a loop with its own model; one sensor is stuck for a while."""
     motor = LagrangianComponent("motor", system)
     for component in (controller, motor):
         component.enter_initialization(0.0, ticks * STEP, {"alpha": 1.2} if component is motor else {})
@@ -94,7 +96,9 @@ def in_loop(controller: Any, system: LagrangianSystem, ticks: int, names: list[s
     given = np.array([controller.index(name) for name in system.state_names])
     told, v = np.array([controller.index(name) for name in names]), np.array([motor.index("v")])
     for k in range(ticks):
+        held = states[0]
         motor.get(measured, states)
+        states[0] = held if k in stuck else states[0]
         controller.set(given, states)
         controller.get(told, rows[k])
         motor.set(v, rows[k, :1])
@@ -121,6 +125,20 @@ def test_answers_equal_those_of_the_controller_in_process(case: str, tmp_path: P
     found = in_loop(FmuComponent("f", path), MOTOR, 100, names)
     np.testing.assert_allclose(found[:, 0], expected[:, 0], rtol=0, atol=1e-9)
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("estimator", ["none", DISTURBED], ids=["none", "ekf"])
+def test_measurements_are_found_lost_as_in_process(estimator: Any, tmp_path: Path) -> None:
+    settings = options(
+        estimator=estimator, dropout={"stale": 2, "timeout": 0.1}, safe_input={"v": 1}, horizon=10
+    )
+    controller = NmpcController("c", MOTOR, settings, STEP, HERE)
+    path = export_model(controller_model(controller, settings, HERE, "Nmpc"), tmp_path)
+    names, stuck = told(controller), range(30, 50)
+    expected = in_loop(controller, MOTOR, 80, names, stuck)
+    assert set(expected[:, names.index("solve_status")]) == {0.0, 3.0}
+    found = in_loop(FmuComponent("f", path), MOTOR, 80, names, stuck)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7)
 
 
 def test_networks_predict_as_in_process(tmp_path: Path) -> None:

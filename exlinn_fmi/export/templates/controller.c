@@ -18,7 +18,7 @@ enum {
     M_DISTURBANCE = M_ESTIMATE + N_X, M_COST = M_DISTURBANCE + N_Q, M_STAGE, M_CHANGE, M_STATUS, M_MISSING,
     M_ITERATIONS, M_KKT, M_FALLBACKS, M_SLACK, M_END, M_LEVEL /* the last two with a terminal set */
 };
-enum { SMOOTHNESS = 0 };
+enum { SMOOTHNESS = 0, LOST = 3 };
 enum { N_Z = N_X + N_D, GRID = 2 * HORIZON + 1, ORDERS_1 = 5, N_MOTION = N_REFERENCED * ORDERS_1, REACH = 8 };
 
 /* A reference over one horizon on a grid of half intervals (control/reference.py). */
@@ -43,6 +43,8 @@ typedef struct {
     int weighed;
     double error[N_X]; /* state less reference that is expected at the coming tick */
     double P[N_X][N_X], cost, stage, kkt, slack, end, level;
+    int heard;
+    double measured[N_X], repeats[N_X], silent[N_X]; /* as in control/dropout.py */
     double fallbacks;
 } Memory;
 
@@ -258,6 +260,29 @@ static int missing(const double *y)
         count += MEASURED[i] && !isfinite(y[i]);
     }
     return count;
+}
+
+/* The measurements, NAN where missing (control/dropout.py); 1 where one has been missing for too long. */
+static int hear(const Memory *m, Memory *f, const double *values, double *y)
+{
+    int lost = 0;
+    for (int i = 0; i < N_X; i++) {
+        y[i] = f->measured[i] = values[i];
+        f->repeats[i] = m->heard && values[i] == m->measured[i] ? m->repeats[i] + 1.0 : 0.0;
+        if (STALE && m->believed && MEASURED[i] && isfinite(y[i])) {
+            double off = values[i] - m->mean[i];
+            if (TURN[i] > 0.0) {
+                off -= rint(off / TURN[i]) * TURN[i];
+            }
+            if (fabs(off) > MEASUREMENT[i] && f->repeats[i] >= STALE) {
+                y[i] = NAN;
+            }
+        }
+        f->silent[i] = MEASURED[i] && !isfinite(y[i]) ? m->silent[i] + 1.0 : 0.0;
+        lost |= f->silent[i] * SAMPLE > TIMEOUT[0] * (1.0 + 1e-9);
+    }
+    f->heard = 1;
+    return lost;
 }
 
 /* What the measurements tell of the state at their time: 0 before all have come once. */
@@ -639,11 +664,12 @@ static void tick(State *s)
 {
     const Memory *m = &s->now;
     Memory *f = &s->following;
-    const double *y = s->values;
     double mean[N_Z], P[N_Z][N_Z], at_tick[N_Z], state[N_X] = {0}, force[N_Q] = {0}, u[N_U];
+    double y[N_X];
     int branch[N_REFERENCED];
 
-    const int known = believe(m, y, mean, P);
+    *f = *m;
+    const int lost = hear(m, f, s->values, y), known = believe(m, y, mean, P);
     memcpy(at_tick, mean, sizeof mean);
     if (known && LATE && m->applied_known) {
         predict(mean, P, m->applied);
@@ -656,17 +682,20 @@ static void tick(State *s)
         branch[r] = m->decided ? m->branch[r]
                     : FOLLOWED[r].through == YOKE ? (int)floor(state[FOLLOWED[r].state] / PI) : 0;
     }
-    *f = *m;
     refer(&f->reference, m->referenced ? &m->reference : NULL, m->time + (SLOW ? SAMPLE : 0.0), state, branch, force);
     double x0[N_X];
     for (int i = 0; i < N_X; i++) {
         x0[i] = known ? state[i] : NAN;
     }
-    solve(s, m, &f->reference, x0);
-    const nmpc *head = solver(s);
-    if (head->status == NMPC_FAILED) {
+    nmpc *head = solver(s);
+    if (lost) {
+        head->status = LOST, head->iterations = 0;
+    } else {
+        solve(s, m, &f->reference, x0);
+    }
+    if (lost || head->status == NMPC_FAILED) {
         f->fallbacks = m->fallbacks + 1.0;
-        if (m->planned && m->left > 0) {
+        if (!lost && m->planned && m->left > 0) {
             memcpy(u, m->plan_u[0], sizeof u);
             shift_plan(&m->plan_x[0][0], &m->plan_u[0][0], f->reference.force, f);
             f->left = m->left - 1;
