@@ -73,9 +73,12 @@ def experiment(work: Run, learn: LearnFromPlant) -> Dataset:
     """Excite the plant through the master as `learn.training` and `learn.test` say.
 
     Raises:
+        DataError: nothing can be learned from what the plant did; the rows are on disk.
         RunError: the plant failed, or the user stopped the run; the rows so far are on disk.
     """
     from exlinn_fmi.data.dataset import Dataset
+    from exlinn_fmi.data.doubts import audit
+    from exlinn_fmi.errors import DataError
 
     runs: list[Trajectories] = []
     for spec in (*learn.training, *learn.test):
@@ -86,7 +89,15 @@ def experiment(work: Run, learn: LearnFromPlant) -> Dataset:
     coordinates = tuple(c.coordinate() for c in learn.coordinates)
     columns = {str(name): values.to_numpy() for name, values in table(learn, runs).items()}
     held_out = tuple(range(len(learn.training), len(runs)))
-    return replace(Dataset.from_columns(columns, coordinates, units(learn, runs[0])), held_out=held_out)
+    names = [f"learn.{key}[{k}]" for key in ("training", "test") for k in range(len(getattr(learn, key)))]
+    try:
+        dataset = replace(
+            Dataset.from_columns(columns, coordinates, units(learn, runs[0])), held_out=held_out
+        )
+        return replace(dataset, notes=tuple(audit(dataset, names)))
+    except DataError:
+        write_table(work.folder / "dataset", table(learn, runs), units(learn, runs[0]))
+        raise
 
 
 def excite(work: Run, learn: LearnFromPlant, experiment: Experiment) -> Trajectories:

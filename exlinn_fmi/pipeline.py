@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from exlinn_fmi.data.files import write_rows, write_table, write_text
+from exlinn_fmi.data.files import read_json, write_rows, write_table, write_text
 from exlinn_fmi.errors import ExlinnError, InputError, RunError
 from exlinn_fmi.experiment import cosimulate, experiment, store_of
 from exlinn_fmi.factory import inspect
@@ -65,7 +65,7 @@ def collect(work: Run) -> Dataset:
         key = fingerprint(spec, learn.plant, measured, experiments, files=work.files(spec, experiments))
     if work.unchanged("collect", key, detail):
         dataset = load_dataset(work.folder)
-        for note in dataset.notes:
+        for note in dataset.notes or ():
             work.warn(note)
         return dataset
     began = time.perf_counter()
@@ -76,7 +76,7 @@ def collect(work: Run) -> Dataset:
             dataset = experiment(work, learn)
     except ExlinnError as error:
         raise work.failed("collect", error) from None
-    for note in dataset.notes:
+    for note in dataset.notes or ():
         work.warn(note)
     work.done("collect", key, save_dataset(work.folder, dataset), began)
     return dataset
@@ -92,6 +92,8 @@ def train(work: Run) -> None:
     settings = learn.model_dump(mode="json", exclude={"design"})  # which looks at what is learned here
     key = fingerprint(settings, seed, truth(work), work.stages.key("collect"))
     if work.unchanged("train", key, f"preset {learn.method.preset}"):
+        for doubt in read_json(work.folder / "model.json")["provenance"]["doubts"]:
+            work.warn(doubt)
         return
     from exlinn_fmi.data.dataset import split
     from exlinn_fmi.learn.card import report_card
@@ -104,9 +106,15 @@ def train(work: Run) -> None:
 
     began, tests = time.perf_counter(), dataset.tests
     part, validation = split(dataset.training, learn.train_fraction, learn.split_blocks, seed)
-    model = fit(part, validation, learn.method, seed, show, work.stop, learn.objective, learn.structure)
+    method, structure, objective = learn.method, learn.structure, learn.objective
+    try:
+        model = fit(part, validation, method, seed, show, work.stop, objective, structure)
+        card = report_card(model, part, tests, learn.identify, truth(work), objective)
+    except ExlinnError as error:
+        raise work.failed("train", error) from None
+    for doubt in model.provenance["doubts"]:
+        work.warn(doubt)
     written = save_model(work.folder, model)
-    card = report_card(model, part, tests, learn.identify, truth(work), learn.objective)
     written += write_table(work.folder / "evaluation", card.evaluation, card.units)
     parameters = work.folder / "parameters.csv"
     write_text(parameters, card.parameters.to_csv(index=False))

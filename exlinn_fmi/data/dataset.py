@@ -9,7 +9,7 @@ Columns: ``trajectory`` (int), ``time`` [s], positions that are not cyclic, velo
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -55,7 +55,8 @@ class Dataset:
         coordinates: the generalised coordinates.
         units: unit by column name; those of the coordinates are filled in.
         held_out: trajectories that training never sees.
-        notes: what the user should know of where the data came from.
+        notes: what the user should know of the data, None where nobody has looked (`doubts.audit`).
+        estimated: columns that were estimated from others.
 
     Raises:
         DataError: a column is missing or not numeric, a value is not finite, or time does not increase.
@@ -65,7 +66,8 @@ class Dataset:
     coordinates: tuple[Coordinate, ...]
     units: Mapping[str, str] = field(default_factory=dict)
     held_out: tuple[int, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] | None = None
+    estimated: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_coordinates(self.coordinates)
@@ -101,7 +103,9 @@ class Dataset:
                     f"data set: column {name!r} has {len(values)} rows, expected {rows} as in 'time'"
                 )
         frame = pd.DataFrame({"trajectory": np.zeros(rows, dtype=int), **arrays})
-        return cls(estimate_missing(frame, coordinates), coordinates, units or {})
+        whole = estimate_missing(frame, coordinates)
+        estimated = tuple(name for name in required_columns(coordinates) if name not in frame)
+        return cls(whole, coordinates, units or {}, estimated=estimated)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -147,7 +151,7 @@ class Dataset:
     def select(self, trajectories: Iterable[int]) -> Dataset:
         """The data set of some of the trajectories."""
         chosen = self.frame["trajectory"].isin(list(trajectories))
-        return Dataset(self.frame[chosen], self.coordinates, self.units)
+        return replace(self, frame=self.frame[chosen], held_out=())
 
 
 def matched(name: str) -> str:
@@ -213,7 +217,7 @@ def _pick(
     frame = dataset.frame.iloc[rows].copy()
     breaks = (np.diff(rows) != 1) | (np.diff(frame["trajectory"].to_numpy()) != 0)
     frame["trajectory"] = np.concatenate([[0], np.cumsum(breaks)])
-    return Dataset(frame, dataset.coordinates, dataset.units)
+    return replace(dataset, frame=frame, held_out=())
 
 
 # ── missing columns ──────────────────────────────────────────────────────────────────────────────────────
@@ -321,36 +325,6 @@ def _check_time(frame: pd.DataFrame) -> None:
         )
 
 
-def check_excitation(dataset: Dataset) -> None:
-    """Refuse data that no model can be trained on.
-
-    Raises:
-        DataError: too few samples, no input that varies, or a column that is constant although it is needed.
-    """
-    frame = dataset.frame
-    if len(frame) < MINIMUM_ROWS:
-        raise DataError(
-            f"data set: found {len(frame)} rows to train on, expected at least {MINIMUM_ROWS}; "
-            "record for longer"
-        )
-    constant = {name for name in required_columns(dataset.coordinates) if np.ptp(frame[name]) == 0}
-    for c in dataset.coordinates:
-        positions = [] if c.topology == "cyclic" else [c.name]
-        for name in (*positions, c.velocity, c.acceleration):
-            if name in constant:
-                raise DataError(
-                    f"data set: column {name!r} is {frame[name].iloc[0]:.9g} in all {len(frame)} rows, so "
-                    f"nothing can be learned of {c.name!r}; excite it, or leave the coordinate out"
-                )
-    inputs = input_names(dataset.coordinates)
-    if all(name in constant and frame[name].iloc[0] == 0 for name in inputs):
-        named = ", ".join(map(repr, inputs)) or "none is named"
-        raise DataError(
-            f"data set: no input acts in any row ({named}), so the scale of 𝓛 cannot "
-            "be learned; drive an input"
-        )
-
-
 # ── files ────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -367,6 +341,7 @@ def save_dataset(folder: Path, dataset: Dataset) -> list[Path]:
         "coordinates": [asdict(c) for c in dataset.coordinates],
         "held_out": dataset.held_out,
         "notes": dataset.notes,
+        "estimated": dataset.estimated,
     }
     write_json(meta, content)
     return [folder / "dataset.csv", folder / "dataset.parquet", meta]
@@ -383,7 +358,8 @@ def load_dataset(folder: Path) -> Dataset:
     try:
         content = read_json(meta)
         coordinates = tuple(Coordinate(**c) for c in content["coordinates"])
-        held_out, notes = tuple(content.get("held_out", ())), tuple(content.get("notes", ()))
+        stated = [name for name in ("held_out", "notes", "estimated") if content.get(name) is not None]
+        more = {name: tuple(content[name]) for name in stated}
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise DataError(f"{meta}: no coordinates can be read from it ({error}); collect again") from error
-    return Dataset(frame, coordinates, units, held_out, notes)
+    return Dataset(frame, coordinates, units, **more)

@@ -96,6 +96,16 @@ def noise_level(values: Signal) -> float:
     return float(np.median(np.abs(differences)) / 0.6745 / gain)
 
 
+def noise_gain(window: int, order: int = 1) -> float:
+    """Standard deviation of the derivative of white noise of deviation 1, at unit steps.
+
+    Args:
+        window: number of samples in the filter's window.
+        order: of the derivative.
+    """
+    return float(np.linalg.norm(savgol_coeffs(window, DEGREE, deriv=order)))
+
+
 def best_window(values: Signal, order: int = 1) -> int:
     """The window that Lepski's rule chooses.
 
@@ -110,7 +120,7 @@ def best_window(values: Signal, order: int = 1) -> int:
     while int(size) | 1 <= min(len(values), LONGEST):
         window = int(size) | 1
         estimate = _filter(values, window, order)
-        deviation = sigma * float(np.linalg.norm(savgol_coeffs(window, DEGREE, deriv=order)))
+        deviation = sigma * noise_gain(window, order)
         inner = slice(window // 2, len(values) - window // 2)
         for other, spread in tried:
             if _rms(estimate[inner] - other[inner]) > BAND * float(np.hypot(deviation, spread)) / 2:

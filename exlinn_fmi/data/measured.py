@@ -8,7 +8,6 @@ gaps, and evened out where its steps differ. Then what is missing of velocities 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -58,7 +57,7 @@ def import_measured(data: Measured, coordinates: tuple[Coordinate, ...], folder:
     training, tests = held_out(data, seed)
     recordings = _record_all([folder / name for name in (*training, *tests)], data, coordinates)
     count, inputs = len(training), input_names(coordinates)
-    notes = [note for recording in recordings for note in recording.table.notes] + _estimated(recordings)
+    notes = [note for recording in recordings for note in recording.notes] + _estimated(recordings)
     notes += check_recordings(recordings[:count], recordings[count:], coordinates)
     grid = as_grid(data)
     between = "hold" if grid is None else grid.inputs
@@ -76,8 +75,13 @@ def import_measured(data: Measured, coordinates: tuple[Coordinate, ...], folder:
     kept = required_columns(coordinates)
     frame = frame[kept + [name for name in map(matched, inputs) if name in frame]]
     first = sum(map(len, groups[:count]))
-    dataset = Dataset(frame, coordinates, held_out=tuple(range(first, len(frames))))
-    return replace(dataset, notes=tuple(notes if tests else [*notes, NO_TEST]))
+    return Dataset(
+        frame,
+        coordinates,
+        held_out=tuple(range(first, len(frames))),
+        notes=tuple(notes if tests else [*notes, NO_TEST]),
+        estimated=tuple(name for name in kept if name not in {"trajectory", *measured}),
+    )
 
 
 def held_out(data: Measured, seed: int) -> tuple[list[str], list[str]]:
@@ -175,7 +179,8 @@ def record(path: Path, data: Measured, coordinates: tuple[Coordinate, ...]) -> R
         if c.topology == "circle":
             columns[c.name] = unwrap(columns[c.name], c.unit)
     estimated = tuple(c.velocity for c in coordinates if c.velocity not in columns)
-    return Recording(table, pd.DataFrame({"time": time - time[0], **columns}), estimated)
+    frame = pd.DataFrame({"time": time - time[0], **columns})
+    return Recording(path.name, table.at, frame, estimated, tuple(table.notes))
 
 
 def convert(table: ForeignTable, column: Column, unit: str) -> Signal:
@@ -264,7 +269,7 @@ def _gap_notes(
     several = f" (the largest of {len(cuts)} gaps)" if len(cuts) > 1 else ""
     dropped = f"; {short} part{'s' * (short > 1)} of less than {SHORTEST} rows left out" if short else ""
     yield (
-        f"{recording.table.at(largest)}: no rows for {steps[largest - 1]:.4g} s before this one{several}, "
+        f"{recording.at(largest)}: no rows for {steps[largest - 1]:.4g} s before this one{several}, "
         f"the usual step is {usual:.4g} s: what comes after a gap is a trajectory of its own{dropped}"
     )
 
@@ -274,7 +279,7 @@ def _jitter_note(recording: Recording, steps: Signal, step: float) -> str:
     row = int(np.argmax(steps)) + 1
     return (
         f"{recording.name}: steps from {steps.min():.4g} to {steps.max():.4g} s (the largest at "
-        f"{recording.table.at(row)}): evened out to {step:g} s; say so with `resample: {step:g}`, or if only "
+        f"{recording.at(row)}): evened out to {step:g} s; say so with `resample: {step:g}`, or if only "
         f"the time stamps jitter give `step: {step:g}` in the place of `time`"
     )
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.learn.basis import entry, families, generic_basis
-from exlinn_fmi.learn.discover import COARSE, Discovery, discover, eliminate, least_mass, spread_over
+from exlinn_fmi.learn.discover import COARSE, ROUNDS, Discovery, discover, eliminate, least_mass, spread_over
 from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.learn.noise import CLEAN, noise_levels, relative_noise
 from exlinn_fmi.learn.projection import Make, solve
@@ -44,8 +44,8 @@ SHORT = 1e-3
 NO_FORMULA = (
     "no short sum of these terms is true here; take the preset 'structured' or give terms of your own"
 )
-STAGES = 5
-"""About as many iterates does the learner give."""
+STAGES = ROUNDS + 2
+"""Most iterates that the learner gives."""
 CONSISTENT = 1e-8
 """Accelerations that leave no more than this share of the forces unexplained were measured, or as good as."""
 RESOLVED = 1e-4

@@ -6,6 +6,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -14,9 +15,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from exlinn_fmi.data.dataset import Dataset, check_excitation, required_columns
-from exlinn_fmi.errors import TrainingError
+from exlinn_fmi.data.dataset import Dataset, required_columns
+from exlinn_fmi.data.doubts import audit
+from exlinn_fmi.errors import DataError, TrainingError
 from exlinn_fmi.learn.iterate import Iterate
+from exlinn_fmi.learn.verdict import NOTHING, POOR, judge
 from exlinn_fmi.mechanics.coordinates import input_names, state_names
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.learned import ModelSpec, learned_system
@@ -24,6 +27,9 @@ from exlinn_fmi.mechanics.structure import UNKNOWN, Structure
 from exlinn_fmi.scenario.learning import Objective, Paper, Structured, Terms
 
 Status = Literal["converged", "iterations", "interrupted"]
+ADVICE = (
+    "check the columns of the data, their signs and units, and whether `coordinates` are those of the plant"
+)
 HISTORY = ["iteration", "stage", "loss", "validation_loss", "seconds"]
 """Columns of the training history."""
 
@@ -100,26 +106,27 @@ def train(
 
     Raises:
         DataError: nothing can be learned from the data.
-        TrainingError: the loss is not finite from the start.
+        TrainingError: the loss is not finite from the start, or the model predicts nothing.
     """
-    check_excitation(train)
+    told = audit(train)
+    # Notes are on the whole recordings, of which these may be a part.
+    doubts = list(told if train.notes is None else train.notes)
     began = time.perf_counter()
-    spec, iterates, total = _learner(train, validation, method, seed, objective, structure)
     best: Iterate | None = None
     status: Status = "converged"
     rows: list[tuple[int, str, float, float, float]] = []
-    for number, now in enumerate(iterates):
-        rows.append((number, now.stage, now.loss, now.validation_loss, time.perf_counter() - began))
-        if math.isfinite(now.validation_loss) and (best is None or now.rank < best.rank):
-            best = now
-        if progress is not None:
-            progress(TrainProgress(number, total, now.loss, now.validation_loss))
-        if number >= total:
-            status = "iterations"
-            break
-        if should_stop():
-            status = "interrupted"
-            break
+    with _solvable():
+        spec, iterates, total = _learner(train, validation, method, seed, objective, structure)
+        for number, now in enumerate(iterates):
+            rows.append((number, now.stage, now.loss, now.validation_loss, time.perf_counter() - began))
+            if math.isfinite(now.validation_loss) and (best is None or now.rank < best.rank):
+                best = now
+            if progress is not None:
+                progress(TrainProgress(number, total, now.loss, now.validation_loss))
+            status = "iterations" if number >= total else "converged"
+            if should_stop():
+                status = "interrupted"
+                break
     if best is None:
         raise TrainingError(
             "the loss was not finite in any iteration; check the data's units and columns for outliers"
@@ -132,10 +139,30 @@ def train(
         "samples": len(train),
         "data_sha256": _data_hash(train),
         "ranges": _ranges(train),
+        "doubts": doubts,
         **best.notes,
     }
     history = pd.DataFrame(rows, columns=HISTORY)
-    return TrainedModel(spec, best.weights, history, status, time.perf_counter() - began, provenance)
+    model = TrainedModel(spec, best.weights, history, status, time.perf_counter() - began, provenance)
+    verdict = judge(model.system, train)
+    if verdict.error >= NOTHING and status != "interrupted":
+        raise TrainingError(f"{verdict}: it has learned nothing; {ADVICE}")
+    if verdict.error >= POOR:
+        doubts.append(f"{verdict}; {ADVICE}")
+    return model
+
+
+@contextmanager
+def _solvable() -> Iterator[None]:
+    """A solve that breaks down is told of as what it is: data that determine no model."""
+    try:
+        with np.errstate(all="ignore"):  # what comes of it is judged in the end
+            yield
+    except np.linalg.LinAlgError as error:
+        raise TrainingError(
+            f"the equations of motion of these data cannot be solved ({error}): they determine no model; "
+            f"{ADVICE}"
+        ) from error
 
 
 def _learner(
@@ -163,6 +190,14 @@ def _learner(
     from exlinn_fmi.learn.structured import iterate_structured, most_iterations, structured_spec
 
     spec, start = structured_spec(train, method, seed, structure)
+    unknowns = sum(int(mask.sum()) for mask in spec.layout.free.values())
+    if len(train) * len(train.coordinates) < unknowns:
+        raise DataError(
+            f"data set: {len(train)} rows to fit (without those that validate) give "
+            f"{len(train) * len(train.coordinates)} equations for {unknowns} weights, expected at least "
+            f"{-(-unknowns // len(train.coordinates))} rows; record for longer, lower `learn.method.hidden`, "
+            "or choose the preset 'terms'"
+        )
     iterates = iterate_structured(spec, start, train, validation, method, objective)
     return spec, iterates, most_iterations(method, objective, train)
 

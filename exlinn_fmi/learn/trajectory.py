@@ -145,7 +145,7 @@ class Information:
         values, vectors, size = self._scaled
         kept = values > SINGULAR * values.max()
         inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
-        return np.asarray(inverse / np.outer(size, size))
+        return np.asarray(inverse / size[:, None] / size)
 
     @property
     def unknown(self) -> Float[Array, "D P"]:

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 
 from exlinn_fmi.data.dataset import (
     Dataset,
-    check_excitation,
     estimate_missing,
     load_dataset,
     required_columns,
     save_dataset,
     split,
 )
+from exlinn_fmi.data.doubts import audit
 from exlinn_fmi.errors import DataError
 from exlinn_fmi.mechanics.coordinates import Coordinate
 
@@ -245,19 +245,19 @@ def test_rows_of_a_trajectory_stand_together() -> None:
 
 
 def test_excited_data_are_accepted() -> None:
-    check_excitation(DATA)
+    audit(DATA)
 
 
 def test_too_few_rows_are_refused() -> None:
-    with pytest.raises(DataError, match="found 10 rows to train on, expected at least 20"):
-        check_excitation(Dataset(frame(10, 1), COORDINATES))
+    with pytest.raises(DataError, match="trajectory 0: 10 rows in all, expected at least 20"):
+        audit(Dataset(frame(10, 1), COORDINATES))
 
 
 def test_a_constant_column_is_refused() -> None:
-    with pytest.raises(DataError, match=r"column 'alpha' is 0.5 in all 80 rows, so nothing can be learned"):
-        check_excitation(Dataset(frame().assign(alpha=0.5), COORDINATES))
+    with pytest.raises(DataError, match=r"'alpha' is 0.5 in all rows, so nothing can be learned"):
+        audit(Dataset(frame().assign(alpha=0.5), COORDINATES))
 
 
 def test_data_without_any_input_are_refused() -> None:
-    with pytest.raises(DataError, match=r"no input acts in any row \('v'\)"):
-        check_excitation(Dataset(frame().assign(v=0.0), COORDINATES))
+    with pytest.raises(DataError, match=r"'v' is 0 in all rows, so the model's scale stays open"):
+        audit(Dataset(frame().assign(v=0.0), COORDINATES))

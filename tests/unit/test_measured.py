@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from measured_helpers import COLUMNS, COORDINATES, load, load_frame, recording, write
 
 from exlinn_fmi.data.dataset import load_dataset, save_dataset
-from exlinn_fmi.data.doubts import plateaus
+from exlinn_fmi.data.faults import plateaus
 from exlinn_fmi.data.measured import held_out, resample, unwrap
 from exlinn_fmi.errors import DataError
 from exlinn_fmi.scenario.learning import Measured, Resample
@@ -438,7 +438,7 @@ def test_a_part_of_the_circle_that_is_not_visited_is_told_of(tmp_path):
 
 def test_a_quantity_that_stands_still_in_one_file_is_told_of(tmp_path):
     write(tmp_path, a=recording(), b=recording(phase=1).assign(i=0.0))
-    assert "b.csv: 'i' is 0 in all rows of this file" in load(tmp_path, files=["a.csv", "b.csv"]).notes
+    assert "b.csv: 'i' is 0 in all its rows" in load(tmp_path, files=["a.csv", "b.csv"]).notes
 
 
 def test_a_constant_input_is_told_of(tmp_path):
