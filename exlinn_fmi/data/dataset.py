@@ -96,12 +96,11 @@ class Dataset:
         arrays = {name: np.asarray(values) for name, values in columns.items()}
         if "time" not in arrays:
             raise DataError(f"data set: column 'time' is missing; found {', '.join(arrays) or 'no column'}")
-        rows = len(arrays["time"])
+        rows = arrays["time"].size
         for name, values in arrays.items():
             if values.shape != (rows,):
-                raise DataError(
-                    f"data set: column {name!r} has {len(values)} rows, expected {rows} as in 'time'"
-                )
+                found = f"{len(values)} rows" if values.ndim == 1 else f"the shape {values.shape}"
+                raise DataError(f"data set: column {name!r} has {found}, expected {rows} as in 'time'")
         frame = pd.DataFrame({"trajectory": np.zeros(rows, dtype=int), **arrays})
         whole = estimate_missing(frame, coordinates)
         estimated = tuple(name for name in required_columns(coordinates) if name not in frame)
@@ -273,8 +272,9 @@ def _estimate(
         names = ["time", column, driven or "time"]
         time, values, force = frame[names].iloc[rows].to_numpy(dtype=float).T
         try:
-            window = best_window(values, order) if len(rows) >= SHORTEST else None
-            found[rows] = derivative(time, values, order, window)
+            with np.errstate(over="ignore"):  # values out of all proportion are told of by `doubts`
+                window = best_window(values, order) if len(rows) >= SHORTEST else None
+                found[rows] = derivative(time, values, order, window)
         except DataError as error:
             raise DataError(f"data set: column {column!r} of trajectory {number}: {error}") from error
         seen[rows] = derivative(time, integral(time, force, between, order), order, window)

@@ -67,7 +67,7 @@ def estimate(data: Dataset, options: Identify, truth: Mapping[str, float], objec
             found = start(basis, data, segments, known)
             fit = maximum_likelihood(system, segments, found[free])
             fit = fit._replace(p=np.where(free, spread(fit.p, free), known))
-        except TrainingError:
+        except (TrainingError, np.linalg.LinAlgError):
             return Estimate(None, "read off the learned model: the monomials alone predict nothing")
         size = data.frame[system.state_names].std().to_numpy()
         excess = float((fit.sigma / np.maximum(segments.sigma, CLEAN * size)).max())

@@ -68,7 +68,7 @@ class Normal(NamedTuple):
         matrix[np.diag_indices_from(matrix)] += damping * size**2
         try:
             return _finite(-cho_solve(cho_factor(matrix), self.gradient * size) * size)
-        except LinAlgError:
+        except (LinAlgError, ValueError):  # the latter where entries are not finite
             return None
 
     def fall(self, step: Vector) -> float:

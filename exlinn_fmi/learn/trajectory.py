@@ -274,6 +274,8 @@ class Shooting:
         """What the data tell of p at θ."""
         matrix, r = self.normal(theta).matrix, self._motion.size
         try:
+            if not np.isfinite(matrix).all():
+                raise np.linalg.LinAlgError
             cross = np.linalg.solve(matrix[r:, r:], matrix[r:, :r])
         except np.linalg.LinAlgError as error:
             raise TrainingError(

@@ -54,6 +54,9 @@ class Regression(NamedTuple):
         Args:
             ridge: weight of ‖p‖² in that scale.
             known: coefficients that are held, NaN where they are to be found.
+
+        Raises:
+            LinAlgError: the equations are not finite.
         """
         p = np.full(self.terms, np.nan) if known is None else known.copy()
         free = np.isnan(p)
@@ -62,6 +65,8 @@ class Regression(NamedTuple):
         size = np.linalg.norm(columns, axis=(0, 1))
         size[size == 0] = 1
         matrix, right = (columns / size).reshape(right.size, len(size)), -right.ravel()
+        if not (np.isfinite(matrix).all() and np.isfinite(right).all()):
+            raise np.linalg.LinAlgError("their coefficients are not finite")
         if ridge:
             matrix = np.vstack([matrix, np.sqrt(ridge) * np.eye(len(size))])
             right = np.concatenate([right, np.zeros(len(size))])
