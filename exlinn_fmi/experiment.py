@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     from exlinn_fmi.data.dataset import Dataset
     from exlinn_fmi.scenario.learning import Experiment, LearnFromPlant
     from exlinn_fmi.scenario.schema import Simulate
+
+PART = "simulate.part"
+"""Folder of a run that goes on, in its run folder: checkpoints and rows."""
 
 COMPARED = ("L", "D")
 """Plant outputs that, where there are any of that name, the report compares the learned 𝓛 and D with."""
@@ -66,7 +70,12 @@ def store_of(work: Run, span: Simulate, key: str, resume: bool) -> Store | None:
 
     if span.stream is False and span.checkpoint is None and not resume:
         return None
-    return Store(work.folder / "simulate.part", span.checkpoint, key, resume, always=bool(span.stream))
+    return Store(work.folder / PART, span.checkpoint, key, resume, always=bool(span.stream))
+
+
+def remove_part(work: Run) -> None:
+    """Remove what a run has kept on disk while it went on."""
+    shutil.rmtree(work.folder / PART, ignore_errors=True)
 
 
 def experiment(work: Run, learn: LearnFromPlant) -> Dataset:

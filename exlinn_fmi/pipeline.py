@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from exlinn_fmi.data.files import read_json, write_rows, write_table, write_text
 from exlinn_fmi.errors import ExlinnError, InputError, RunError
-from exlinn_fmi.experiment import cosimulate, experiment, store_of
+from exlinn_fmi.experiment import cosimulate, experiment, remove_part, store_of
 from exlinn_fmi.factory import inspect
 from exlinn_fmi.stages import fingerprint
 from exlinn_fmi.workspace import Reporter, Run, Silent, metrics
@@ -180,6 +180,7 @@ def simulate(work: Run, resume: bool = False) -> None:
     key = fingerprint(settings, files=[*work.files(scenario), *sorted(model)])
     detail = f"{span.stop - span.start:g} s in steps of {span.step:g} s"
     if work.unchanged("simulate", key, detail):
+        remove_part(work)  # of a run that was killed when it was just done
         return
     from exlinn_fmi.components.events import MONITOR, with_events
     from exlinn_fmi.components.links import with_links
@@ -190,9 +191,9 @@ def simulate(work: Run, resume: bool = False) -> None:
     facts: dict[str, str] = {}
     several = sum(bool(component.facts) for component in components.values()) > 1
     for name, component in components.items():
-        for key, fact in component.facts.items():
-            work.reporter.note(f"{name}: {key.replace('_', ' ')}: {fact}")
-            facts[f"control.{name}.{key}" if several else f"control.{key}"] = fact
+        for what, fact in component.facts.items():
+            work.reporter.note(f"{name}: {what.replace('_', ' ')}: {fact}")
+            facts[f"control.{name}.{what}" if several else f"control.{what}"] = fact
         for warning in component.warnings:
             work.warn(f"{name}: {warning}")
     if scenario.events:
@@ -207,22 +208,27 @@ def simulate(work: Run, resume: bool = False) -> None:
         written = write_table(stem, result.frame, result.units)
     else:
         written = write_rows(stem, list(map(str, result.frame)), result.units, result.rows.blocks())
-    if store is not None and (result.error is None or span.checkpoint is None):
-        store.remove()
     if result.rows is not None and len(result.frame) < result.rows.rows:
         share = round(result.rows.rows / len(result.frame))
         work.warn(f"metrics and figures are made of every {share}th of {result.rows.rows} rows")
     told = result.statistics
     statistics = {f"simulate.{k}": v for k, v in told.items() if isinstance(v, int | float | str)}
-    taken = told.get("component_seconds", {}).items()
-    statistics |= {f"simulate.component_seconds.{name}": seconds for name, seconds in taken}
+    for what in ("component_seconds", "late_steps", "longest_step"):
+        statistics |= {f"simulate.{what}.{name}": value for name, value in told.get(what, {}).items()}
+    for name, late in told.get("late_steps", {}).items():
+        if late:
+            longest = told["longest_step"][name]
+            work.warn(f"{name}: {late} steps took longer than `pace` leaves them, at worst {longest:.3g} s")
     judged = control_metrics(result.frame, scenario, result.units)
     work.replace_metrics(("control.", "simulate."), judged | facts | statistics)
     for name, said in told["warnings"].items():
         work.warn(f"{name}: {said['count']} warnings, the first: {said['first']}")
+    if result.error is None:
+        work.done("simulate", key, written, began)
+    if store is not None and (result.error is None or span.checkpoint is None):
+        store.remove()  # not before: who is killed until here goes on from the last checkpoint
     if result.error is not None:
         raise work.failed("simulate", result.error)
-    work.done("simulate", key, written, began)
 
 
 def sweep(work: Run) -> None:

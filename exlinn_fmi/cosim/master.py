@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from exlinn_fmi.components.base import Component
+from exlinn_fmi.components.base import Component, Values
 from exlinn_fmi.cosim.adaptive import Adaptive, AdaptiveOptions
 from exlinn_fmi.cosim.extrapolation import ExtrapolationOptions
 from exlinn_fmi.cosim.graph import Graph
 from exlinn_fmi.cosim.loops import SOLVERS, LoopOptions
-from exlinn_fmi.cosim.pace import Pace
+from exlinn_fmi.cosim.pace import Pace, timing_columns
 from exlinn_fmi.cosim.plan import Plan
 from exlinn_fmi.cosim.profile import Timed
 from exlinn_fmi.cosim.recorder import TIME, Recorder, select
@@ -56,7 +56,8 @@ class Trajectories:
             component: ``count`` and text of the ``first``) and, where asked for, ``component_seconds`` (by
             component); ``loop_passes`` and ``loop_residual`` (their number, the worst accepted) where
             algebraic loops are solved; ``missed_deadlines``, ``worst_delay`` and ``first_delay_at`` [s] of a
-            run that is paced; ``communication_steps``, ``rejected_steps``, ``inexact_steps`` (kept in spite
+            run that is paced, ``late_steps`` and ``longest_step`` [s] of its components, by name;
+            ``communication_steps``, ``rejected_steps``, ``inexact_steps`` (kept in spite
             of their error) and ``shortest_step`` [s] where steps are adaptive.
         rows: all rows, where the run has a store.
     """
@@ -126,6 +127,7 @@ class Master:
         self._loops, self._extrapolation, self._adaptive = loops, extrapolation, adaptive
         if adaptive is not None:
             select(graph.components, adaptive.tolerances)
+        self._timed = profile
         self._stepper: Stepper | None = None
 
     def run(
@@ -157,12 +159,13 @@ class Master:
         """
         starts = starts or {}
         components: list[Component] = list(self.graph.components.values())
-        if self._profile:
+        self._timed = self._profile or pace is not None
+        if self._timed:
             components = [Timed(component) for component in components]
-        watch = Watch(progress, should_stop, store, None if pace is None else Pace(pace))
+        watch = Watch(progress, should_stop, store)
         try:
             _check_names(self.graph, "start values", starts)
-            recorder = self._recorder(store)
+            recorder = self._recorder(store, [] if pace is None else timing_columns(self.graph.names))
             plan = Plan(
                 self.graph,
                 components,
@@ -174,6 +177,11 @@ class Master:
                 self._loops,
                 self._extrapolation,
             )
+            if pace is not None:
+                own = {name: e * self.step for name, e in zip(self.graph.names, self.every, strict=True)}
+                watch.pace = Pace(pace, own, lambda: self._seconds(components), recorder)
+                # Its columns are written after their row.
+                plan.columns = np.append(plan.columns, np.zeros(1 + len(own), dtype=plan.columns.dtype))
             error = self._attempt(plan, recorder, starts, watch) or _flush(recorder)
         finally:
             faults = _close(components)
@@ -181,19 +189,20 @@ class Master:
             plan.warn(number, text)
         statistics = self._statistics(plan, recorder, watch)
         if self._profile:
-            timed = [c.seconds for c in components if isinstance(c, Timed)]
-            inside = np.zeros(len(timed)) if self._stepper is None else self._stepper.seconds
-            statistics["component_seconds"] = {
-                name: seconds + float(more)
-                for name, seconds, more in zip(self.graph.names, timed, inside, strict=True)
-            }
+            seconds = self._seconds(components).tolist()
+            statistics["component_seconds"] = dict(zip(self.graph.names, seconds, strict=True))
         return Trajectories(recorder.frame(), recorder.units, error, statistics, recorder.file)
 
-    def _recorder(self, store: Store | None) -> Recorder:
-        """An empty table for time and recorded variables."""
-        names = [TIME, *map(self.graph.path, self.recorded)]
-        stated = [self.graph.variable(port).unit for port in self.recorded]
-        units = {name: unit for name, unit in zip(names, ["s", *stated], strict=True) if unit is not None}
+    def _seconds(self, components: Sequence[Component]) -> Values:
+        """For how long each component has been at work [s]."""
+        timed = np.array([c.seconds for c in components if isinstance(c, Timed)])
+        return timed if self._stepper is None else timed + self._stepper.seconds
+
+    def _recorder(self, store: Store | None, timing: list[str]) -> Recorder:
+        """An empty table for time, recorded variables, and what is told of the pace."""
+        names = [TIME, *map(self.graph.path, self.recorded), *timing]
+        stated = ["s", *(self.graph.variable(port).unit for port in self.recorded), *("s" for _ in timing)]
+        units = {name: unit for name, unit in zip(names, stated, strict=True) if unit is not None}
         file = None if store is None else store.row_file(self.ticks // self._every + 1, len(names))
         return Recorder(names, units, self.ticks, self._every, file)
 
@@ -245,7 +254,7 @@ class Master:
     def _make_stepper(self, plan: Plan, recorder: Recorder) -> Stepper:
         if self._adaptive is not None:
             return Adaptive(plan, recorder, self.start, self.step, self._adaptive)
-        return make_stepper(plan, recorder, self.start, self.step, self._profile, self._compiled)
+        return make_stepper(plan, recorder, self.start, self.step, self._timed, self._compiled)
 
     def _statistics(self, plan: Plan, recorder: Recorder, watch: Watch) -> dict[str, Any]:
         steps, seconds, loops = max(recorder.rows - 1, 0) * self._every, watch.seconds, plan.loops

@@ -117,6 +117,14 @@ class Recorder:
             self.table[row - self.base] = signals[columns]
             self.rows = row + 1
 
+    def amend(self, tick: int, values: Values) -> bool:
+        """Write the last columns of a tick's row that is recorded already; whether it has one."""
+        row = tick // self.every - self.base
+        if tick % self.every or row < 0:
+            return False
+        self.table[row, -len(values) :] = values
+        return True
+
     def room(self, tick: int) -> int:
         """How many ticks after this one have room in the table for their rows; makes room as needed."""
         room = (self.base + len(self.table)) * self.every - 1 - tick

@@ -27,7 +27,9 @@ class Watch:
         progress: told (fraction done, t [s]).
         should_stop: whether the user wants to stop.
         store: where checkpoints are kept.
-        pace: what holds the run to real time.
+
+    Attributes:
+        pace: what holds the run to real time, None where nothing does.
     """
 
     def __init__(
@@ -35,9 +37,8 @@ class Watch:
         progress: Progress | None,
         should_stop: Callable[[], bool] | None,
         store: Store | None,
-        pace: Pace | None,
     ) -> None:
-        self.pace = pace
+        self.pace: Pace | None = None
         self._progress, self._should_stop, self._store = progress, should_stop, store
         self._began, self._before = time.perf_counter(), 0.0
         self._report_at = 0.0
@@ -82,7 +83,7 @@ class Watch:
             self._progress(k / ticks, t)
             self._report_at = time.perf_counter() + REPORT_EVERY
         if self.pace is not None:
-            self.pace.wait(t, self._should_stop)
+            self.pace.wait(k, t, self._should_stop)
         if k == ticks:
             return False
         if self.stopping:

@@ -64,6 +64,10 @@ WORDING = (
     (r"study\.(rmse|max_error)_(.+)_max", "{0} of {1}, worst run", ""),
     (r"simulate\.steps", "Communication steps", ""),
     (r"simulate\.seconds", "Time of the co-simulation", "s"),
+    (r"simulate\.missed_deadlines", "Communication points that came late", ""),
+    (r"simulate\.worst_delay", "… by at most", "s"),
+    (r"simulate\.late_steps\.(.+)", "Steps of {0} that took longer than they may", ""),
+    (r"simulate\.longest_step\.(.+)", "… the longest", "s"),
     (r"simulate\.real_time_factor", "Faster than real time by a factor of", ""),
 )
 """Pattern of a metric's key, what it means, unit; groups of the pattern go into the text."""

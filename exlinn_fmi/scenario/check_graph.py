@@ -182,6 +182,8 @@ def recorded(survey: Survey) -> Iterator[Finding]:
     """Names to record that match nothing, and a metric of what is not recorded."""
     simulate = survey.scenario.simulate
     patterns = simulate.record if simulate is not None else []
+    if simulate is not None and simulate.pace is not None and "timing" in survey.names:
+        yield ("components", "timing"), "the columns that tell of `pace` are called timing.NAME; rename it"
     for k, pattern in enumerate(patterns):
         problem = _no_match(survey, pattern)
         if problem:

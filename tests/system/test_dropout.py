@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from exlinn_fmi import cli
 
@@ -62,3 +63,15 @@ def test_after_a_while_without_measurements_the_safe_input_is_applied_and_told(t
     assert np.all(table["motor.v"][lost] == 1)
     assert metrics["control.lost_samples"] == metrics["control.fallbacks"] == 20
     assert "lost_samples" not in simulate(tmp_path, "{stale: 1}")[1]
+
+
+def test_a_closed_loop_that_has_not_changed_is_not_run_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    simulate(tmp_path, "{}")
+    left = tmp_path / "run" / "simulate.part"
+    left.mkdir()  # as if it had been killed when it was just done
+    capsys.readouterr()
+    simulate(tmp_path, "{}")
+    assert "simulate  unchanged since the last run" in capsys.readouterr().err
+    assert not left.exists()

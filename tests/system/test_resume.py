@@ -130,6 +130,9 @@ def test_a_paced_run_reports_its_deadlines(tmp_path: Path):
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["simulate.seconds"] >= 0.25
     assert "simulate.missed_deadlines" in metrics
+    assert metrics["simulate.late_steps.motor"] >= 0
+    table = pd.read_csv(tmp_path / "out" / "trajectories.csv")
+    assert metrics["simulate.longest_step.motor"] == pytest.approx(table["timing.motor"].max())
     assert metrics["simulate.stepping"] == "plain"
     assert 0 < metrics["simulate.component_seconds.motor"] < metrics["simulate.seconds"]
 

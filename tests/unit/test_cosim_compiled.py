@@ -250,6 +250,14 @@ def test_compiled_stepping_is_chosen_where_it_pays(probes: dict[int, Path]):
     assert stepping(3e3) == "compiled"
 
 
+def test_a_paced_run_tells_the_time_of_compiled_calls_and_of_those_from_python(probes: dict[int, Path]):
+    graph = Graph({"p": FmuComponent("p", probes[2]), "i": Integrator("i")}, [])
+    result = Master(graph, 0.0, 1.0, 0.01, compiled=True).run(pace=100.0)
+    assert result.statistics["stepping"] == "compiled"
+    assert np.all(result.frame[["timing.p", "timing.i"]].to_numpy()[1:] > 0.0)
+    assert np.all(result.frame["p.x"].notna())
+
+
 def test_without_functions_to_call_stepping_is_plain():
     graph = Graph({"i": Integrator("i")}, [])
     assert Master(graph, 0.0, 1.0, 0.1, compiled=True).run().statistics["stepping"] == "plain"

@@ -217,10 +217,63 @@ def test_deadlines_that_are_missed_are_counted():
                 time.sleep(0.1)
             return super().step(t, h)
 
-    told = Master(graph([Slow("a")]), 0.0, 1.0, 0.1).run(pace=2.0).statistics
+    result = Master(graph([Slow("a"), Integrator("b")]), 0.0, 1.0, 0.1).run(pace=2.0)
+    told = result.statistics
     assert told["missed_deadlines"] >= 1
     assert told["worst_delay"] >= 0.05 - 1e-3
     assert told["first_delay_at"] is not None
+    assert told["late_steps"]["a"] >= 1
+    assert told["longest_step"]["a"] >= 0.1
+    rows = result.frame
+    assert list(rows)[-3:] == ["timing.delay", "timing.a", "timing.b"]
+    assert {result.units[name] for name in list(rows)[-3:]} == {"s"}
+    assert rows["timing.a"][6] >= 0.1  # the step from 0.5 to 0.6 s
+    assert told["worst_delay"] == rows["timing.delay"].max()
+    assert told["longest_step"]["b"] == rows["timing.b"].max()
+    assert told["late_steps"]["a"] == np.count_nonzero(rows["timing.a"] > 0.05)
+
+
+def test_a_component_of_longer_steps_may_take_longer():
+    class Slow(Integrator):
+        def step(self, t: float, h: float) -> object:
+            import time
+
+            time.sleep(0.01)
+            return super().step(t, h)
+
+    def late(own: float) -> int:
+        made = Master(graph([Slow("a")]), 0.0, 200.0, 50.0, {"a": own}).run(pace=1e4)
+        return made.statistics["late_steps"]["a"]
+
+    assert late(50.0) == 4  # 5 ms are left for each
+    assert Master(graph([Slow("a")]), 0.0, 2.0, 1.0).run(pace=2.0).statistics["late_steps"]["a"] == 0
+
+
+def test_a_row_tells_the_worst_since_the_one_before():
+    class Slow(Integrator):
+        def step(self, t: float, h: float) -> object:
+            import time
+
+            time.sleep(0.05 * (round(t) == 4))
+            return super().step(t, h)
+
+    rows = Master(graph([Slow("a")]), 0.0, 12.0, 1.0, record_every=3).run(pace=1e3).frame
+    assert len(rows) == 5
+    assert np.argmax(rows["timing.a"]) == 2
+    assert rows["timing.a"][2] >= 0.05
+
+
+def test_a_run_without_pace_has_no_timing():
+    result = Master(graph([Integrator("a")]), 0.0, 1.0, 0.1).run()
+    assert not [name for name in result.frame if name.startswith("timing")]
+    assert "late_steps" not in result.statistics
+
+
+def test_paced_rows_stream_to_disk_as_well(tmp_path: Path):
+    store = Store(tmp_path, None, "key", resume=False, always=True)
+    result = Master(graph([Integrator("a")]), 0.0, 1.0, 0.1).run(store=store, pace=100.0)
+    assert list(result.frame)[-2:] == ["timing.delay", "timing.a"]
+    assert np.all(result.frame["timing.a"][1:] > 0.0)
 
 
 def test_a_paced_run_can_be_stopped_while_it_waits():
