@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.control.batch import Batch
 from exlinn_fmi.control.compiled import Kernel
+from exlinn_fmi.control.realtime import CompiledGaussNewton
 from exlinn_fmi.control.reference import References
 from exlinn_fmi.control.solver import Plan, Solver, SolveStatus, make_solver
 from exlinn_fmi.plants.dc_motor_cart import PLANT
@@ -173,6 +174,26 @@ def peers(given: Problem, loop: Loop) -> Iterator[tuple[str, NDArray[np.float64]
         yield "acados_default", Acados(given.ocp, "SQP_RTI", tuned=False).times(loop.states, loop.aims)[0]
 
 
+def cold(quick: bool) -> Figures:
+    """The quadratic program alone, from no set: random states, bounds and weights, far from the plan."""
+    pin()
+    given, rng, spent, methods = problem.__wrapped__(), np.random.default_rng(0), [], []
+    ours = make_solver(given.ocp, "rti", 1, 1e-8, "compiled")
+    assert isinstance(ours, CompiledGaussNewton)
+    kernel = ours.kernel
+    for _ in range(300 if quick else 3000):
+        x0 = rng.uniform([0.2, -5.0, -4.5], [2.9, 5.0, 4.5])
+        agreement.draw(ours, rng)
+        aim = given.aim(rng.uniform(0.0, 2.5), x0)
+        ours.prepare(aim, Plan(aim.x, aim.u))
+        kernel.x0[:] = x0
+        spent.append(seconds(kernel.feedback))
+        methods.append(kernel.head.method)
+    shares = np.bincount(methods, minlength=3) / len(methods)
+    figures = {"cold.qp_mean_us": 1e6 * np.mean(spent), "cold.failures": shares[0], "cold.circles": shares[2]}
+    return microseconds(np.array(spent), "cold.qp") | figures
+
+
 def scaling(quick: bool) -> Figures:
     """How a step grows with the horizon and with the network."""
     pin()
@@ -216,6 +237,7 @@ def memory(quick: bool) -> Figures:
 
 FIGURES: dict[str, Callable[[bool], Figures]] = {
     "speed": speed,
+    "cold": cold,
     "scaling": scaling,
     "memory": memory,
     **agreement.FIGURES,
@@ -232,6 +254,7 @@ BARS: dict[str, tuple[float, float]] = {
     "scaling.width256_over_width32": (12, 12),
     "agree.max_dv_converged": (1e-4, 1e-4),
     "agree.failures": (0, 0),
+    "cold.failures": (0, 0),
     "memory.blocks_per_step": (0, 0),
 }
 """What a figure must reach, and what it should; ratios to peers at least, all else at most."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import io
 import re
 import shutil
 import subprocess
@@ -32,7 +34,7 @@ from exlinn_fmi.control import compiled
 from exlinn_fmi.control.compiled import Kernel, kernel_sources
 from exlinn_fmi.control.ocp import Ocp
 from exlinn_fmi.control.pack import pack_networks
-from exlinn_fmi.control.qp import StageQp, make_qp_solver
+from exlinn_fmi.control.qp import ConicQp, StageQp, make_qp_solver
 from exlinn_fmi.control.realtime import CompiledGaussNewton
 from exlinn_fmi.control.solver import Plan, SolveStatus, make_solver
 from exlinn_fmi.errors import RunError, SolverError
@@ -231,6 +233,33 @@ def test_random_programs_are_solved_as_by_hpipm(rated, seed):
     np.testing.assert_allclose(dz[1:], following, atol=1e-9 * (1.0 + np.abs(dz).max()))
     assert (du >= qp.u_low - 1e-7).all()
     assert (du <= qp.u_high + 1e-7).all()
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["plain", "rated"])
+def exact(request):
+    """A kernel, and qpOASES for its programs: an active-set method, exact where it succeeds."""
+    with contextlib.redirect_stdout(io.StringIO()):  # it shows its licence
+        return PROGRAMS[request.param], ConicQp("qpoases", 8, 4 + 2 * request.param, 2, SOFT, request.param)
+
+
+def test_programs_whose_sets_go_round_in_circles_are_solved_exactly(exact):
+    kernel, other = exact
+    methods = set()
+    for seed in range(60):
+        qp = program(seed, kernel)
+        _, du = solved(kernel, qp)
+        assert kernel.head.status == SolveStatus.SOLVED
+        methods.add(kernel.head.method)
+        with contextlib.redirect_stdout(io.StringIO()):
+            reference = other.solve(qp)
+        assert reference.solved
+        np.testing.assert_allclose(du, reference.du, atol=1e-8)
+    assert methods == {1, 2}
+
+
+def test_a_program_that_once_had_no_solution():
+    solved(PROGRAMS[True], program(698, PROGRAMS[True]))
+    assert PROGRAMS[True].head.status == SolveStatus.SOLVED
 
 
 def objective(qp: StageQp, dx: NDArray, du: NDArray) -> float:

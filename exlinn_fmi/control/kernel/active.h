@@ -3,7 +3,7 @@
  * Each round solves the program with the present set as equalities, then every input and softened state decides
  * anew what it does, all at once (M. Hintermüller, K. Ito, K. Kunisch, SIAM J. Optim. 13, 2002). A state or a rate
  * that is kept at its bound is held there by a stiff spring whose force is corrected until the gap has gone. Rounds
- * may go round in circles: then the interior-point method takes over.
+ * may go round in circles: where they no longer make the changes fewer, the interior-point method takes over.
  */
 #ifndef ACTIVE_H
 #define ACTIVE_H
@@ -14,6 +14,7 @@
 #define PULLED 1e-11 /* a multiplier has the wrong sign, over the largest one */
 #define HELD 1e-12   /* a held state is at its bound, over 1 + the bound's size */
 #define CORRECTIONS 12
+#define PATIENCE 5 /* rounds with no fewer changes than ever before that make a circle */
 
 /* A held quantity: spring and force at its bound. */
 static inline void hold(double stiff, double force, double bound, double *weight, double *slope) {
@@ -97,11 +98,13 @@ static inline long long decide_state(const stages *v, int at, double x, double *
     return decide_held(v, was, x, low, high, force, rough);
 }
 
-/* Every input, rate and softened state decides anew; returns the last node that changed, −1: none. */
-static int decide(const stages *v) {
+/* Every input, rate and softened state decides anew, `changes` of them otherwise than before; returns the last node
+ * that changed, −1: none. */
+static int decide(const stages *v, int *changes) {
     const int z = v->z, m = v->m, s = v->s, N = v->N;
     int changed = -1;
     double scale = 0.0;
+    *changes = 0;
     for (int at = 0; at < N * m; ++at)
         if (v->on[at] != FREE) scale = larger(scale, fabs(v->pull[at]));
     const double rough = v->loose * PULLED * scale;
@@ -115,17 +118,18 @@ static int decide(const stages *v) {
                 for (int j = 0; j < z; ++j) force -= v->G[at * z + j] * dz[j];
             }
             long long now = decide_held(v, v->on[at], v->du[at], v->u_low[at], v->u_high[at], force, rough);
-            if (now != v->on[at]) v->on[at] = now, set_input(v, at), changed = k;
+            if (now != v->on[at]) v->on[at] = now, set_input(v, at), changed = k, ++*changes;
             if (!v->rated || k == 0) continue;
             const double low = v->rate_low[at], high = v->rate_high[at], d = v->du[at] - dz[v->n + i];
             force = spring(v->taut[i], v->tugged[at], d, v->slew[at], low, high);
             now = decide_held(v, v->slew[at], d, low, high, force, rough);
-            if (now != v->slew[at]) v->slew[at] = now, v->tugged[at] = 0.0, set_rate(v, at), changed = k;
+            if (now != v->slew[at]) v->slew[at] = now, v->tugged[at] = 0.0, set_rate(v, at), changed = k, ++*changes;
         }
         for (int at = k * s; at < (k + 1) * s; ++at) {
             double push;
             long long now = decide_state(v, at, v->dz[(k + 1) * z + v->soft[at % s]], &push);
-            if (now != v->state[at]) v->state[at] = now, v->pushed[at] = push, set_state(v, at), changed = k + 1;
+            if (now == v->state[at]) continue;
+            v->state[at] = now, v->pushed[at] = push, set_state(v, at), changed = k + 1, ++*changes;
         }
     }
     return changed;
@@ -161,18 +165,22 @@ static int correct(const stages *v) {
 
 /* Solve from the sets in force; the recursion is up to date above node `from`. 0 where rounds do not end. */
 static int solve_active(stages *v, int from, int most) {
-    int corrections = 0;
+    int corrections = 0, changes, least = v->N * (2 * v->m + v->s) + 1, waited = 0;
     for (int round = 0; round < most; ++round) {
         if (from >= 0 && !factor(v, from)) return 0;
         roll(v);
         ++v->iterations;
-        from = decide(v);
+        from = decide(v, &changes);
+        if (changes < least)
+            least = changes, waited = 0;
+        else if (++waited == PATIENCE)
+            return 0;
         while (from < 0) {
             if (!correct(v)) return all_finite(v->du, v->N * v->m) && all_finite(v->dz, (v->N + 1) * v->z);
             if (++corrections > CORRECTIONS) return 0;
             vectors(v);
             roll(v);
-            from = decide(v);
+            from = decide(v, &changes);
         }
     }
     return 0;

@@ -1,7 +1,8 @@
 /* The quadratic program by a primal-dual interior-point method on top of the Riccati recursion.
  *
  * Mehrotra's predictor and corrector (J. Nocedal, S. Wright, Numerical Optimization, 2nd ed., §16.6). It needs no
- * start and does not go round in circles: what the active set cannot settle is solved here, and then handed back.
+ * start and does not go round in circles: what the active set cannot settle is solved here, and handed back as soon as
+ * its sets can be told.
  *
  * Rows a·y ≤ bound at each stage: inputs low, high; rates low, high; softened states low, high. A softened row is
  * a·y − σ ≤ bound with σ ≥ 0 at the price l1 σ + ½ l2 σ²; its slack and multiplier are eliminated.
@@ -12,6 +13,8 @@
 #include "active.h"
 
 #define INTERIOR_ROUNDS 80
+#define TELLING 1e-3 /* mean product of gaps and multipliers, over the cost, from which on sets are tried */
+#define TRIES 3
 
 typedef struct {
     int soft;      /* index of the softened bound, −1: none */
@@ -124,13 +127,13 @@ static int interior_start(stages *v) {
     for (int i = 0; i < us; ++i) v->du[i] = larger(smaller(0.0, v->u_high[i]), v->u_low[i]);
     memset(v->dz + v->z, 0, sizeof(double) * (size_t)(v->N * v->z));
     double price = larger(largest(v->r, us), largest(v->g, (v->N + 1) * v->z)), room = 1.0;
-    price = larger(price, 1e-2 * largest(v->H_u, v->m * v->m));
+    /* Far inside: from near the bounds the first steps would be short. */
+    price = 30.0 * larger(price, 1e-2 * largest(v->H_u, v->m * v->m));
     for (int k = 0; k < v->N; ++k)
         for (int i = 0; i < rows; ++i) {
             row r = row_at(v, k, i);
             if (r.bound < INFINITY) room = larger(room, smaller(fabs(r.bound - r.value), 1e3));
         }
-    room *= 0.1;
     int count = 0;
     for (int k = 0; k < v->N; ++k)
         for (int i = 0; i < rows; ++i) {
@@ -196,11 +199,27 @@ static void read_sets(stages *v) {
     }
 }
 
+/* Settle the sets that the interior point tells of by the active set; 0: it cannot, and the point is as it was. */
+static int settle(stages *v, double loose) {
+    const size_t zs = sizeof(double) * (size_t)((v->N + 1) * v->z), us = sizeof(double) * (size_t)(v->N * v->m);
+    memcpy(v->z_old, v->dz, zs);
+    memcpy(v->u_old, v->du, us);
+    read_sets(v);
+    set_all(v);
+    v->interior = 0, v->loose = loose;
+    if (solve_active(v, v->N, 10)) return 1;
+    memcpy(v->dz, v->z_old, zs);
+    memcpy(v->du, v->u_old, us);
+    memset(v->on, 0, us);
+    v->interior = 1;
+    return 0;
+}
+
 /* Solve without regard to the sets, which are left as found here; 0 where it does not converge. */
 static int solve_interior(stages *v) {
     const int rows = v->N * (4 * v->m + 2 * v->s), zs = (v->N + 1) * v->z, us = v->N * v->m;
     double product;
-    int solved = 0;
+    int solved = 0, tries = TRIES;
     memset(v->on, 0, sizeof(long long) * (size_t)us);
     v->interior = 1;
     const int count = interior_start(v);
@@ -237,11 +256,12 @@ static int solve_interior(stages *v) {
         }
         left *= 1.0 - length;
         const double cost = cost_size(v) / count;
+        if (left < 1e-6 && mean < TELLING * cost && tries-- > 0 && settle(v, 1.0)) return 1;
         /* Where rounding stops it just before, the active set is told apart all the same. */
         solved = left < 1e-9 && (mean < 1e-11 * cost || (mean < 1e-7 * cost && length < 0.1));
     }
+    if (solved && settle(v, 1e3)) return 1; /* a close decision at the solution is of no account */
     v->interior = 0;
-    if (solved) read_sets(v);
     return solved;
 }
 
@@ -250,18 +270,9 @@ static int solve_interior(stages *v) {
  * The recursion is up to date above node `from`. Returns 0: no solution, 1: active set, 2: interior point.
  */
 static int solve_stages(stages *v, int from) {
-    const int zs = (v->N + 1) * v->z, us = v->N * v->m;
     v->iterations = 0, v->loose = 1.0;
     if (solve_active(v, from, 25)) return 1;
-    if (!solve_interior(v)) return 0;
-    memcpy(v->z_old, v->dz, sizeof(double) * (size_t)zs);
-    memcpy(v->u_old, v->du, sizeof(double) * (size_t)us);
-    v->loose = 1e3; /* it is near the solution, and a close decision there is of no account */
-    set_all(v);
-    if (solve_active(v, v->N, 10)) return 2;
-    memcpy(v->dz, v->z_old, sizeof(double) * (size_t)zs);
-    memcpy(v->du, v->u_old, sizeof(double) * (size_t)us);
-    return 2;
+    return solve_interior(v) ? 2 : 0;
 }
 
 #endif
