@@ -65,6 +65,9 @@ class NativeStep:
     pointers: tuple[int, ...] = ()
 
 
+State = Literal["on", "off", "keep"]
+
+
 @dataclass(frozen=True)
 class Change:
     """What a component does to a value on its way, in the vector that the master has.
@@ -72,7 +75,7 @@ class Change:
     Args:
         position: of the value among those set or got.
         kind: ``set`` to the number, ``add`` it, ``scale`` by it, or ``hold``: the number is the value
-            that was kept last.
+            that was kept last, not a number where that is none: the first is kept then.
         number: (1,) see `kind`.
         state: what is done at a communication point [s]: ``on``, ``off``, or ``keep`` the value in `number`;
             None where it is always on.
@@ -81,7 +84,7 @@ class Change:
     position: int
     kind: Literal["set", "add", "scale", "hold"]
     number: NDArray[np.float64]
-    state: Callable[[float], Literal["on", "off", "keep"]] | None = None
+    state: Callable[[float], State] | None = None
 
 
 class Native(ABC):
@@ -89,9 +92,11 @@ class Native(ABC):
 
     Attributes:
         step: its step.
+        turns: times [s] about which `Change.state`, `frozen` or what `arrive` sets may become another.
     """
 
     step: NativeStep
+    turns: Sequence[float] = ()
 
     @abstractmethod
     def access(self, verb: Literal["Get", "Set"], indices: Indices) -> Sequence[NativeAccess]:
@@ -109,3 +114,24 @@ class Native(ABC):
     def changes(self, verb: Literal["Get", "Set"], indices: Indices) -> Sequence[Change]:
         """What becomes of values of the variables at `indices`, before `Set` or after `Get`, in order."""
         return ()
+
+    def frozen(self, t: float) -> bool:
+        """Whether the component is neither set nor stepped at t [s]."""
+        return False
+
+    @property
+    def lag(self) -> float:
+        """Time that it is behind [s]: a step at t is one at t − lag for its C function."""
+        return 0.0
+
+    @property
+    def arrives(self) -> bool:
+        """Whether `arrive` ever sets anything."""
+        return False
+
+    def arrive(self, t: float) -> int:
+        """Set what no exchange does, first thing at t [s]; needed at `turns` only. Gives a `Status`."""
+        return 0
+
+    def passed(self, t: float, h: float, steps: int) -> None:  # noqa: B027 - most need not know
+        """Take note of so many steps of h [s] that were due, the last of them from t [s]."""

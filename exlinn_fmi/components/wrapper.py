@@ -91,7 +91,7 @@ class WrapperNative(Native):
     """
 
     def __init__(self, inner: Native) -> None:
-        self.inner, self.step = inner, inner.step
+        self.inner, self.step, self.turns = inner, inner.step, inner.turns
 
     def access(self, verb: Literal["Get", "Set"], indices: Indices) -> Sequence[NativeAccess]:
         """As the inner component."""
@@ -104,3 +104,25 @@ class WrapperNative(Native):
     def changes(self, verb: Literal["Get", "Set"], indices: Indices) -> Sequence[Change]:
         """As the inner component."""
         return self.inner.changes(verb, indices)
+
+    def frozen(self, t: float) -> bool:
+        """As the inner component."""
+        return self.inner.frozen(t)
+
+    @property
+    def lag(self) -> float:
+        """As the inner component."""
+        return self.inner.lag
+
+    @property
+    def arrives(self) -> bool:
+        """As the inner component."""
+        return self.inner.arrives
+
+    def arrive(self, t: float) -> int:
+        """As the inner component."""
+        return self.inner.arrive(t)
+
+    def passed(self, t: float, h: float, steps: int) -> None:
+        """As the inner component."""
+        self.inner.passed(t, h, steps)

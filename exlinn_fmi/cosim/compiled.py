@@ -75,16 +75,18 @@ class Compiled(Stepper):
         """
         k, state, began = self._kernel, self._state, time.perf_counter()
         self._tables = [self._tabulate(source, first, until) for source in self._program.sources]
-        state[k.AT_TICK], state[k.AT], state[k.UNTIL], state[k.BASE] = first, 0, until, self._recorder.base
+        state[k.AT_TICK], state[k.AT], state[k.BASE] = first, 0, self._recorder.base
         self._aim()
         loop, where, calls, reasons = self._loop, self._where, self._calls, k.REASONS
         tick = memoryview(state.data)[k.AT_TICK :]
         try:
-            while reason := loop(where):
-                if reason % reasons == k.CALL:
-                    calls[reason // reasons](tick[0])
-                else:
-                    self._see_to(reason % reasons, reason // reasons)
+            for end in self._program.turns.pieces(first, until):
+                state[k.UNTIL] = end
+                while reason := loop(where):
+                    if reason % reasons == k.CALL:
+                        calls[reason // reasons](tick[0])
+                    else:
+                        self._see_to(reason % reasons, reason // reasons)
         finally:
             recorded = tick[0] - (state[k.AT] > self._program.tick)
             self._recorder.rows = int(recorded) // self._recorder.every + 1
@@ -111,6 +113,8 @@ class Compiled(Stepper):
             self._heed(line, t)
         if act.exchange is not None and reason == self._kernel.REFUSED:
             assert act.vector is not None
+            tick = int(self._state[self._kernel.AT_TICK])
+            self._program.turns.tell_time(act.exchange.component, tick)
             plan.exchange(act.exchange, act.vector, t)  # which ends in an error
         elif act.exchange is not None and act.exchange.outputs is not None:
             plan.check_finite(act.exchange, t)

@@ -46,8 +46,9 @@ DONE, CALL, STATUS, REFUSED, INFINITE = range(5)
 REASONS = 8
 
 # Kinds of moves between memory cells: as they are, from float64 to a type, from a type to float64; or what is
-# in the target is scaled by what is read, or that added to it.
-FROM, SCALE, ADD = 16, 14, 15
+# in the target is scaled by what is read, or that added to it, or held: it is what is read, or is kept there
+# where that is not a number.
+FROM, HOLD, SCALE, ADD = 16, 13, 14, 15
 TYPES = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "truth1", "truth4")
 F8, F4, I1, U1, I2, U2, I4, U4, I8, U8, B1, B4 = range(12)
 
@@ -202,6 +203,10 @@ def _move(moves: Any, first: int, last: int) -> bool:  # pragma: no cover - comp
             _put_f8(target, _get_f8(target) * _get_f8(source))
         elif kind == ADD:
             _put_f8(target, _get_f8(target) + _get_f8(source))
+        elif kind == HOLD:
+            if np.isnan(_get_f8(source)):
+                _put_f8(source, _get_f8(target))
+            _put_f8(target, _get_f8(source))
         elif not _store(kind, _get_f8(source), target):
             return False
     return True
@@ -239,7 +244,7 @@ def _run(
         columns: where the columns of a row are in `signals`.
         signals: the signal vector; its first entry is the time.
         table: rows, from tick `state[BASE]` on.
-        own_steps: step [s] by act.
+        own_steps: (acts, 2) step, and time that it is behind [s].
         span: start time and step [s].
         seconds: time spent by component number, where `state[CLOCK]` is the address of clock_gettime.
         state: see above.
@@ -309,8 +314,8 @@ def _run(
                     result = _step3(
                         program[at, FUNCTION],
                         program[at, HANDLE],
-                        t,
-                        own_steps[at],
+                        t - own_steps[at, 1],
+                        own_steps[at, 0],
                         program[at, FLAG],
                         program[at, EVENT],
                         program[at, END],
@@ -321,7 +326,11 @@ def _run(
                         reason = STATUS
                 else:
                     result = _step2(
-                        program[at, FUNCTION], program[at, HANDLE], t, own_steps[at], program[at, FLAG]
+                        program[at, FUNCTION],
+                        program[at, HANDLE],
+                        t - own_steps[at, 1],
+                        own_steps[at, 0],
+                        program[at, FLAG],
                     )
             elif code == MOVE:
                 _move(moves, program[at, FIRST], program[at, LAST])
@@ -372,7 +381,7 @@ def _entry(context: int) -> int:  # pragma: no cover - compiled
         carray(_pointer(where[COLUMNS]), where[ACROSS], np.uint64),
         carray(_pointer(where[SIGNALS]), where[ACROSS], np.float64),
         carray(_pointer(where[ROWS]), (where[ACTS], where[ACROSS]), np.float64),
-        carray(_pointer(where[OWN_STEPS]), where[ACTS], np.float64),
+        carray(_pointer(where[OWN_STEPS]), (where[ACTS], 2), np.float64),
         carray(_pointer(where[TIMES]), 2, np.float64),
         carray(_pointer(where[SECONDS]), where[ACTS], np.float64),
         carray(_pointer(where[STATE]), STATES, np.int64),

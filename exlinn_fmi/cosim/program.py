@@ -5,20 +5,26 @@ See `kernel.py` for what the columns mean, and `compiled.py` for who runs it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from exlinn_fmi.components.base import Values
-from exlinn_fmi.components.native import Change, Native, NativeAccess
+from exlinn_fmi.components.base import Component, Values
+from exlinn_fmi.components.native import Native, NativeAccess, State
 from exlinn_fmi.cosim import kernel as k
 from exlinn_fmi.cosim.exchange import Advance, Exchange
 from exlinn_fmi.cosim.plan import Plan
+from exlinn_fmi.cosim.turns import Turns
 
 Columns = dict[int, int]
+Move = tuple[int, int, int]
+
+NEVER = 2**62
+"""Span of a line that is left out: it leads beyond the end from any tick."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +71,19 @@ class Program:
     Attributes:
         table: (acts, `kernel.WIDTH`), see `kernel.py`.
         moves: (moves, 3): kind, address read, address written.
-        own_steps: step [s] by act.
+        own_steps: (acts, 2) step, and time that it is behind [s].
         acts: what the lines are part of.
         tick: the line with which the next tick begins.
         sources: components whose values are tabulated.
+        turns: what changes in the course of a run.
     """
 
     def __init__(self, plan: Plan, every: int, start: float, step: float) -> None:
         self._plan, self._start, self._step = plan, start, step
-        self._natives = [component.native() for component in plan.components]
+        self._natives = [self._native(component) for component in plan.components]
+        self.turns = Turns(plan, self._natives, start, step)
         self._lines: list[Columns] = []
-        self._moves: list[tuple[int, int, int]] = []
+        self._moves: list[Move] = []
         self._own: list[float] = []
         self._kept: list[Any] = []
         self.acts: list[Act] = []
@@ -106,7 +114,13 @@ class Program:
         for row, columns in zip(self.table, self._lines, strict=True):
             row[list(columns)] = list(columns.values())
         self.moves = np.array(self._moves or [(0, 0, 0)], dtype=np.int64)
-        self.own_steps = np.array(self._own)
+        self.own_steps = np.stack([self._own, np.zeros(len(self._own))], axis=1)
+
+    def _native(self, component: Component) -> Native | None:
+        """The C functions of a component, unless the plan calls it otherwise and it has to know when."""
+        native = component.native()
+        outside = self._plan.loops is not None or self._plan.extrapolation is not None
+        return None if native is not None and native.turns and outside else native
 
     def _time(self, tick: int) -> float:
         return self._start + tick * self._step
@@ -130,14 +144,56 @@ class Program:
         self._moves += moves
         return first
 
-    def _add_changes(self, changes: Sequence[Change], piece: Values) -> None:
-        """Moves that do to values in a piece of the vector what a component does to them."""
-        kinds = {"set": k.F8, "add": k.ADD, "scale": k.SCALE}
-        for change in changes:
+    def _add_changes(self, x: Exchange, verb: Literal["Get", "Set"], ahead: int) -> None:
+        """Moves that do to values in a piece of the vector what their component does to them."""
+        native, number = self._natives[x.component], x.component
+        indices, piece = (x.inputs, x.given) if verb == "Set" else (x.outputs, x.taken)
+        assert native is not None
+        assert indices is not None
+        kinds = {"set": k.F8, "add": k.ADD, "scale": k.SCALE, "hold": k.HOLD}
+        for change in native.changes(verb, indices):
             self._kept.append(change.number)
-            self._add_moves(
-                [(kinds[change.kind], _address(change.number), _address(piece[change.position :]))]
-            )
+            cell, value = _address(change.number), _address(piece[change.position :])
+            states: dict[State, Move] = {
+                "on": (kinds[change.kind], cell, value),
+                "keep": (k.F8, value, cell),
+                "off": (k.F8, value, value),
+            }
+            place = self._add_moves([states["on"]])
+            if change.state is not None:
+                self.turns.add(number, ahead, partial(self._arrange_move, place, states, change.state))
+
+    def _add_arrival(self, number: int, what: str, due: Columns, ahead: int) -> None:
+        """What a component sets by itself at a new communication point; done only where something changes."""
+        native = self._natives[number]
+        if native is None or not native.arrives:
+            return
+
+        here = 0 if k.TICK in (columns[k.CODE] for columns in self._lines) else ahead
+
+        def arrive(tick: int) -> None:
+            if status := self.turns.tell_time(number, tick + here):
+                self._plan.judge(number, status, what, self._time(tick + here))
+
+        line = self._add(k.PYTHON, due, Act(call=arrive))
+        self.turns.add(number, ahead, lambda t, turning: self._skip(line, not turning))
+
+    def _arrange_move(
+        self, place: int, states: Mapping[State, Move], state: Callable[[float], State], t: float, _: bool
+    ) -> None:
+        self.moves[place] = states[state(t)]
+
+    def _arrange_set(self, line: int, native: Native, t: float, _: bool) -> None:
+        self._skip(line, native.frozen(t))
+
+    def _arrange_step(self, line: int, native: Native, t: float, _: bool) -> None:
+        self._skip(line, native.frozen(t))
+        self.own_steps[line, 1] = native.lag
+
+    def _skip(self, line: int, yes: bool) -> None:
+        """Leave a line out, or not."""
+        columns = {k.EVERY: 2, k.SPAN: NEVER} if yes else self._lines[line]
+        self.table[line, k.EVERY], self.table[line, k.SPAN] = columns.get(k.EVERY, 1), columns.get(k.SPAN, 0)
 
     def _add_step(self, a: Advance) -> None:
         """A step, with its exchanges before and after in Gauss–Seidel."""
@@ -146,7 +202,7 @@ class Program:
             self._add(k.PYTHON, due, Act(call=lambda tick: self._plan.step(a, self._time(tick), a.h)))
             return
         if a.before is not None:
-            self._add_exchange(a.before, self._plan.ahead, due)
+            self._add_exchange(a.before, self._plan.ahead, due, ahead=0)
         extrapolation = self._plan.extrapolation
         if extrapolation is not None and extrapolation.concerns(a.component):
             prepare = extrapolation.prepare
@@ -161,12 +217,14 @@ class Program:
             k.FLAG: step.flag,
         }
         columns |= dict(zip((k.EVENT, k.END, k.EARLY, k.REACHED), step.pointers, strict=False))
-        self._add(k.STEP, columns, Act("the step", "DoStep", native), a.h)
+        self._add_arrival(a.component, "the step", due, ahead=0)
+        line = self._add(k.STEP, columns, Act("the step", "DoStep", native), a.h)
+        self.turns.add(a.component, 0, partial(self._arrange_step, line, native))
         if a.after is not None:
-            self._add_exchange(a.after, self._plan.ahead, due)
+            self._add_exchange(a.after, self._plan.ahead, due, ahead=a.every)
 
-    def _add_exchange(self, x: Exchange, vector: Values, due: Columns) -> None:
-        """An exchange: the calls that set, then those that get."""
+    def _add_exchange(self, x: Exchange, vector: Values, due: Columns, ahead: int = 1) -> None:
+        """An exchange: the calls that set, then those that get; for the tick so many `ahead`."""
         native, who = self._natives[x.component], {**due, k.WHO: x.component}
         first = len(self._moves)
         if x.inputs is not None:
@@ -174,7 +232,10 @@ class Program:
             given = zip(sources.tolist(), _addresses(x.given), strict=True)
             self._add_moves((k.F8, a, b) for a, b in given)
             if native is not None:
-                self._add_changes(native.changes("Set", x.inputs), x.given)
+                self._add_changes(x, "Set", ahead)
+                if native.turns:  # what it is given is recorded even if it is not set
+                    self._add(k.MOVE, {**due, k.FIRST: first, k.LAST: len(self._moves)})
+                    first = len(self._moves)
         check = {k.CHECK: _address(x.taken), k.CHECKED: len(x.taken)}
         if native is None:
             act = Act(call=lambda tick: self._plan.trade(x, self._time(tick)))
@@ -182,6 +243,9 @@ class Program:
             if x.outputs is not None:
                 self._add(k.FINITE, {**due, **check}, Act(exchange=x))
             return
+        self._add_arrival(
+            x.component, "reading outputs" if x.inputs is None else "setting inputs", due, ahead
+        )
         if x.inputs is not None:
             calls = native.access("Set", x.inputs)
             for n, call in enumerate(calls, 1):
@@ -192,7 +256,8 @@ class Program:
                     self._add_moves((kind, a, b) for a, b in cells)
                 columns = {**who, **_arguments(call, values), k.FIRST: first, k.LAST: len(self._moves)}
                 act = Act("setting inputs", call.name, native, x, vector, more=len(calls) - n)
-                self._add(k.SET, columns, act)
+                line = self._add(k.SET, columns, act)
+                self.turns.add(x.component, ahead, partial(self._arrange_set, line, native))
                 first = len(self._moves)
         if x.outputs is not None:
             calls = native.access("Get", x.outputs)
@@ -204,7 +269,7 @@ class Program:
                     cells = zip(out, _addresses(x.taken, call.positions), strict=True)
                     self._add_moves((kind + k.FROM, a, b) for a, b in cells)
                 if n == len(calls):
-                    self._add_changes(native.changes("Get", x.outputs), x.taken)
+                    self._add_changes(x, "Get", ahead)
                 columns = {**who, **_arguments(call, values), k.FIRST: first, k.LAST: len(self._moves)}
                 if n == len(calls):
                     columns |= check

@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exlinn_fmi.components.base import Component, Status, Variable
-from exlinn_fmi.components.events import Effect, Schedule, with_events
+from exlinn_fmi.components.effects import Effect, Schedule
+from exlinn_fmi.components.events import with_events
 from exlinn_fmi.cosim.graph import Graph
 from exlinn_fmi.cosim.master import Master
 from exlinn_fmi.scenario.events import Event
