@@ -214,7 +214,9 @@ def one(
         error = "" if result.error is None else str(result.error)
     except ExlinnError as failed:
         error = str(failed)
-    kept = {name: value for name, value in judged.items() if "solve_ms" not in name}
+    kept = {
+        name: value for name, value in judged.items() if "solve_ms" not in name and "feedback_ms" not in name
+    }
     success = not error and all(kept.get(f"control.{key}", math.inf) <= most[key] for key in most)
     return {NUMBER: number, **drawn, **kept, SUCCESS: float(success), ERROR: error}
 

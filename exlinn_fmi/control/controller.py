@@ -2,8 +2,10 @@
 
 It is sampled and feeds through directly: at each of its ticks the outputs answer the measurements set at that
 very tick, unless `delay: computation` has them answer those of the tick before. The solve takes place when an
-output is first read, and again only if a measurement is changed before the step; `step` keeps the result as
-what the next tick starts from.
+output is first read, and again only if a measurement is changed before the step. `step` keeps the result as
+what the next tick starts from and prepares that: its reference and all of the solve that needs no
+measurement, at the state and under the forces that are expected. Only `feedback_time` is between measurement
+and input then.
 
 A measurement that is missing is replaced by what the estimator expects, until `dropout.timeout`. Where a
 solve fails the previous plan goes on, shifted, as long as it has inputs left; then, or where measurements are
@@ -27,6 +29,7 @@ from exlinn_fmi.control.defaults import completed, estimator, measure, refined
 from exlinn_fmi.control.diagnosis import diagnose
 from exlinn_fmi.control.dropout import Heard, Listener
 from exlinn_fmi.control.estimator import Belief, Estimator, Sample
+from exlinn_fmi.control.memory import Memory
 from exlinn_fmi.control.ocp import HORIZON, Ocp, check_names
 from exlinn_fmi.control.reference import ReferenceGenerator, References
 from exlinn_fmi.control.solver import Plan, Solution, Solver, SolveStatus, Stats, make_solver
@@ -63,49 +66,6 @@ class Parts:
     slow: bool
 
 
-@dataclass(frozen=True)
-class _Memory:
-    """What one tick hands to the next.
-
-    Args:
-        time: of the coming tick [s].
-        branch: branch of the references' kinematics, None before the first measurement.
-        plan: guess for the coming tick, None where there is none.
-        left: how many inputs of the plan are left to fall back on.
-        references: the last reference.
-        belief: what is expected of the state that the coming measurements tell of, None where nothing is.
-        applied: the last input that was found.
-        heard: what came of the measurements so far.
-        fallbacks: how often a fallback was needed so far.
-        cost: last cost.
-        stage: its first term.
-        P: terminal weight of the last solve, without that factor.
-        error: state less reference that it expects at the coming tick.
-        kkt: last KKT residual.
-        slack: last violation of a state bound.
-        end: last terminal cost, without what it is multiplied by for the terminal set.
-        level: α of that set.
-    """
-
-    time: float = 0.0
-    branch: tuple[int, ...] | None = None
-    plan: Plan | None = None
-    left: int = 0
-    references: References | None = None
-    belief: Belief | None = None
-    applied: NDArray[np.float64] | None = None
-    heard: Heard | None = None
-    fallbacks: int = 0
-    cost: float = 0.0
-    stage: float = 0.0
-    P: NDArray[np.float64] | None = None
-    error: NDArray[np.float64] | None = None
-    kkt: float = 0.0
-    slack: float = 0.0
-    end: float = 0.0
-    level: float = 0.0
-
-
 class NmpcController(Component):
     """Nonlinear model predictive controller around a Lagrangian system.
 
@@ -113,8 +73,8 @@ class NmpcController(Component):
     and states of the reference, estimated state and disturbances, cost with its first term and what it may
     have grown by a disturbance, status (0 solved, 1 iteration limit, 2 failed: fallback applied, 3 not solved
     for measurements have been missing for too long: safe input applied), missing measurements, iterations,
-    KKT residual, time taken [s], fallbacks so far, largest violation of a softened bound over its range; with
-    a terminal set, cost of the plan's end and the level that bounds it there.
+    KKT residual, time taken in all and between measurement and input [s], fallbacks so far, largest violation
+    of a softened bound over its range; with a terminal set, cost of the plan's end and the set's level.
 
     Args:
         name: name in the scenario.
@@ -167,8 +127,11 @@ class NmpcController(Component):
         self.variables = nmpc_variables(system.coordinates, options)
         self._measured, self._starts = np.zeros(self._ocp.n), np.zeros(self._ocp.n)
         self._outputs = np.zeros(len(self.variables) - self._ocp.n)
-        self._memory = _Memory()
-        self._following: _Memory | None = None
+        self._memory = Memory()
+        self._following: Memory | None = None
+        self._ready: Memory | None = None
+        """What the solver is prepared for: no part of the state, for it can be had again."""
+        self._preparation = 0.0
         self.warnings = diagnose(self._ocp, self._generator, first, self._estimator)
         self.facts = {"solver_backend": self._solver.backend}
         if self._solver.reason:
@@ -217,7 +180,8 @@ class NmpcController(Component):
         self._generator.check(start_time, stop_time if np.isfinite(stop_time) else start_time)
         self._measured = np.array([float(starts.get(key, 0.0)) for key in names])
         self._starts = self._measured.copy()
-        self._memory, self._following = _Memory(time=start_time), None
+        self._memory, self._following, self._ready = Memory(time=start_time), None, None
+        self._preparation = 0.0
         self.message = ""
         return Status.OK
 
@@ -248,7 +212,7 @@ class NmpcController(Component):
         if self._following is None:
             self._tick()
         assert self._following is not None
-        self._memory, self._following = replace(self._following, time=t + h), None
+        self._memory, self._following = self._prepare(replace(self._following, time=t + h)), None
         return Status.OK
 
     def save_state(self) -> object:
@@ -272,10 +236,52 @@ class NmpcController(Component):
 
     def deserialize_state(self, data: bytes) -> object:
         """A state from bytes."""
-        return unpack(data, (_Memory, Plan, References, Belief, Sample, Heard))
+        return unpack(data, (Memory, Plan, References, Belief, Sample, Heard))
 
     def close(self) -> None:
         """Nothing to free."""
+
+    def _prepare(self, memory: Memory) -> Memory:
+        """Do what needs no measurements of the coming tick; what is to be remembered of it."""
+        begin, belief, plan = perf_counter(), memory.belief, memory.plan
+        coming = replace(memory, coming=None)
+        if (
+            belief is not None
+            and plan is not None
+            and memory.branch is not None
+            and memory.applied is not None
+        ):
+            ahead = self._estimator.predict(belief, memory.applied) if self._late else belief
+            state, force = self._estimator.state(ahead), self._estimator.force(ahead.mean)
+            references = self._references(memory, state, memory.branch, force)
+            guess = Plan(np.vstack([state, plan.x[1:]]), plan.u)
+            coming = replace(memory, plan=guess, coming=references)
+            self._make_ready(coming)
+        self._preparation = perf_counter() - begin
+        return coming
+
+    def _make_ready(self, memory: Memory) -> None:
+        """Prepare the solver, unless it is."""
+        if self._ready is not memory:
+            assert memory.coming is not None
+            assert memory.plan is not None
+            self._solver.prepare(memory.coming, memory.plan, memory.applied)
+            self._ready = memory
+
+    def _solve(self, memory: Memory, state: NDArray[np.float64], references: References) -> Solution:
+        """The solution from a state, by what is prepared where anything is."""
+        if memory.coming is None:
+            return self._solver.solve(state, references, memory.plan, memory.applied)
+        self._make_ready(memory)
+        self._ready = None  # it is used up
+        return self._solver.feedback(state)
+
+    def _references(
+        self, memory: Memory, state: NDArray[np.float64], branch: tuple[int, ...], force: NDArray[np.float64]
+    ) -> References:
+        """The reference of the coming tick's solve."""
+        time = memory.time + (self._step if self._slow else 0.0)
+        return self._generator.over(time, state, branch, memory.references, force)
 
     def _tick(self) -> Status:
         """One round of Algorithm 1 at the present tick."""
@@ -288,15 +294,13 @@ class NmpcController(Component):
         state = np.zeros(self._ocp.n) if ahead is None else self._estimator.state(ahead)
         force = self._generator.still if ahead is None else self._estimator.force(ahead.mean)
         branch = self._generator.branch(state) if memory.branch is None else memory.branch
-        time = memory.time + (self._step if self._slow else 0.0)
-        references = self._generator.over(time, state, branch, memory.references, force)
+        references = memory.coming or self._references(memory, state, branch, force)
         if lost.any():
             memory, solution = replace(memory, plan=None), self._nothing(lost, references)
         else:
             unknown = np.full(self._ocp.n, np.nan)
-            solution = self._solver.solve(
-                unknown if ahead is None else state, references, memory.plan, memory.applied
-            )
+            solution = self._solve(memory, unknown if ahead is None else state, references)
+        feedback = perf_counter() - begin
         message = "; ".join(text for text in (missing, solution.stats.message) if text)
         if solution.status >= SolveStatus.FAILED:
             u, following, action = self._fall_back(memory, references)
@@ -322,13 +326,14 @@ class NmpcController(Component):
         applied = u if not self._slow else self._safe if memory.applied is None else memory.applied
         at_tick = ahead if not self._slow else now
         change = 0.0 if ahead is None else self._change(memory, state - references.x[0])
-        self._write(applied, reported, at_tick, solution, change, perf_counter() - begin)
+        times = self._preparation + perf_counter() - begin, feedback
+        self._write(applied, reported, at_tick, solution, change, times)
         if solution.status == SolveStatus.SOLVED and not missing:
             return Status.OK
         self.message = f"t = {memory.time:.9g} s: {message}"
         return Status.WARNING
 
-    def _believe(self, memory: _Memory, y: NDArray[np.float64]) -> Belief | None:
+    def _believe(self, memory: Memory, y: NDArray[np.float64]) -> Belief | None:
         """What the measurements tell of the state at their time; None before all have come once."""
         belief = None if memory.belief is None else self._estimator.update(memory.belief, y)
         if belief is not None and belief.finite:
@@ -353,7 +358,7 @@ class NmpcController(Component):
         text = f"no measurement of {names} for longer than dropout.timeout ({self._listener.timeout:g} s)"
         return Solution(references.x, references.u, SolveStatus.LOST, Stats(message=text))
 
-    def _change(self, memory: _Memory, error: NDArray[np.float64]) -> float:
+    def _change(self, memory: Memory, error: NDArray[np.float64]) -> float:
         """Most that the cost may grow by the error's being off its prediction, by w.
 
         With a cost eᵀPe: (e + w)ᵀP(e + w) − eᵀPe ≤ 2 √(eᵀPe wᵀPw) + wᵀPw.
@@ -364,7 +369,7 @@ class NmpcController(Component):
         off = max(0.0, float(w @ memory.P @ w))
         return 2.0 * float(np.sqrt(max(0.0, memory.cost - memory.stage) * off)) + off
 
-    def _accept(self, memory: _Memory, solution: Solution, references: References) -> _Memory:
+    def _accept(self, memory: Memory, solution: Solution, references: References) -> Memory:
         """What follows a solution."""
         plan = Plan(*self._ocp.shift(solution.x, solution.u, references.force))
         stats, targets = solution.stats, solution.targets
@@ -392,7 +397,7 @@ class NmpcController(Component):
             level=level,
         )
 
-    def _fall_back(self, memory: _Memory, references: References) -> tuple[NDArray[np.float64], _Memory, str]:
+    def _fall_back(self, memory: Memory, references: References) -> tuple[NDArray[np.float64], Memory, str]:
         """Input of the shifted plan, or the safe one, what follows it, and what was done."""
         count = memory.fallbacks + 1
         if memory.plan is None or memory.left == 0:
@@ -408,7 +413,7 @@ class NmpcController(Component):
         belief: Belief | None,
         solution: Solution,
         change: float,
-        seconds: float,
+        times: tuple[float, float],
     ) -> None:
         """Fill the outputs, in the order of the variables."""
         following, estimator = self._following, self._estimator
@@ -424,7 +429,7 @@ class NmpcController(Component):
                 self._generator.still if belief is None else estimator.force(belief.mean),
                 [following.cost, following.stage, change],
                 [float(solution.status), float(missing), float(solution.stats.iterations)],
-                [following.kkt, seconds, float(following.fallbacks), following.slack],
+                [following.kkt, *times, float(following.fallbacks), following.slack],
                 [following.end, following.level][: 2 * bool(self._ocp.set_weight)],
             ]
         )

@@ -39,9 +39,11 @@ class GaussNewton(PlainSolver):
     def prepare(
         self, references: References, guess: Plan, applied: Float[np.ndarray, " m"] | None = None
     ) -> None:
-        """Linearise at the guess and lay out the quadratic program."""
+        """Linearise at the guess and lay out the quadratic program of a real-time iteration."""
         super().prepare(references, guess, applied)
         self._prepared: tuple[Plan, Linearisation, Targets] | None = None
+        if not self.real_time:
+            return
         targets, lim = self._targets(references, applied), self.ocp.limits
         plan = Plan(guess.x, np.clip(guess.u, lim.u_min, lim.u_max))
         at = self.ocp.linearise(plan.x, plan.u, targets.force)
@@ -50,7 +52,7 @@ class GaussNewton(PlainSolver):
 
     def feedback(self, x0: Float[np.ndarray, " n"]) -> Solution:
         """One step of the quadratic program that was prepared; where that is not to be had, a whole solve."""
-        if self._prepared is not None and np.isfinite(x0).all():
+        if self.real_time and self._prepared is not None and np.isfinite(x0).all():
             plan, at, targets = self._prepared
             step = self._step(plan, at, targets, x0 - plan.x[0])
             if step.solved:

@@ -48,13 +48,16 @@ class CompiledGaussNewton(Solver):
     def prepare(
         self, references: References, guess: Plan, applied: Float[np.ndarray, " m"] | None = None
     ) -> None:
-        """Linearise at the guess, lay out the quadratic program and factor it."""
+        """Linearise at the guess, lay out the quadratic program of a real-time iteration and factor it."""
         super().prepare(references, guess, applied)
-        self._put(references, guess, applied)
-        self.kernel.prepare()
+        if self._plain.real_time:
+            self._put(references, guess, applied)
+            self.kernel.prepare()
 
     def feedback(self, x0: Float[np.ndarray, " n"]) -> Solution:
         """One step of the quadratic program that was prepared; where that is not to be had, a whole solve."""
+        if not self._plain.real_time:
+            return super().feedback(x0)
         self.kernel.x0[:] = x0
         self.kernel.feedback()
         self.kernel.finish()

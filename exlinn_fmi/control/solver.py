@@ -98,7 +98,7 @@ class Solver(ABC):
     def prepare(
         self, references: References, guess: Plan, applied: Float[np.ndarray, " m"] | None = None
     ) -> None:
-        """Do what can be done before the measurement is there.
+        """Do what can be done before the measurement is there: most of `rti`, nothing of what is iterated.
 
         Args:
             references: what to follow.

@@ -38,6 +38,9 @@ from exlinn_fmi.scenario.signals import (
     Table,
 )
 
+TIMES = ("solve_time", "feedback_time")
+"""Outputs of a controller in process that its FMU does not have."""
+
 KINDS = ("SINES", "RAMP", "CHIRP", "CYCLE", "TABLE")
 
 
@@ -76,7 +79,7 @@ def controller_model(
         raise ModelError(f"reference: {inversion.reason}; only flat references become an FMU")
     ocp, name = parts.ocp, identifier
     given = [v for v in controller.variables if v.causality == "input"]
-    told = [v for v in controller.variables if v.causality == "output" and v.name != "solve_time"]
+    told = [v for v in controller.variables if v.causality == "output" and v.name not in TIMES]
     role: Role = "state" if closed else "input"
     inputs = tuple(Quantity(v.name, v.unit or "", v.description or "", role=role) for v in given)
     outputs = tuple(Quantity(v.name, v.unit or "", v.description or "", sampled=True) for v in told)

@@ -27,6 +27,7 @@ DIAGNOSTICS = (
     "iterations",
     "kkt",
     "solve_time",
+    "feedback_time",
     "fallbacks",
     "slack",
     "terminal_cost",
@@ -279,6 +280,9 @@ def _effort(frame: pd.DataFrame, loop: Loop) -> dict[str, float]:
         metrics["solve_ms_p99"] = float(np.percentile(solve, 99))
         metrics["solve_ms_max"] = float(np.max(solve))
         metrics["deadline_misses"] = float(np.count_nonzero(solve > 1e3 * loop.period))
+    if (feedback := 1e3 * recorded("feedback_time")).size:
+        metrics["feedback_ms_median"] = float(np.median(feedback))
+        metrics["feedback_ms_p99"] = float(np.percentile(feedback, 99))
     if (fallbacks := recorded("fallbacks")).size:
         metrics["fallbacks"] = float(fallbacks[-1])
     if (missing := recorded("missing")).size and missing.any():

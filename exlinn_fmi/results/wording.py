@@ -43,6 +43,8 @@ WORDING = (
     (r"control\.solve_ms_median", "Time of a solve, median", "ms"),
     (r"control\.solve_ms_p99", "Time of a solve, 99th percentile", "ms"),
     (r"control\.solve_ms_max", "Time of a solve, longest", "ms"),
+    (r"control\.feedback_ms_median", "Time between measurement and input, median", "ms"),
+    (r"control\.feedback_ms_p99", "Time between measurement and input, 99th percentile", "ms"),
     (r"control\.deadline_misses", "Solves that took longer than the sampling time", ""),
     (r"control\.missing_measurements", "Measurements that were missing, and were predicted", ""),
     (r"control\.lost_samples", "Samples with the safe input, as measurements were missing for too long", ""),

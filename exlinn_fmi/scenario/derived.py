@@ -118,7 +118,8 @@ def nmpc_variables(coordinates: tuple[Coordinate, ...], options: Nmpc) -> tuple[
         output("missing", "1", "measurements that are missing: no number, or stale", "Integer"),
         output("iterations", "1", "iterations of the solver", "Integer"),
         output("kkt", "1", "KKT residual"),
-        output("solve_time", "s", "time that reference and solve took"),
+        output("solve_time", "s", "time that reference and solve took, what is prepared before included"),
+        output("feedback_time", "s", "the part of it between the measurements and the input"),
         output("fallbacks", "1", "fallbacks so far", "Integer"),
         output("slack", "1", "largest violation of a state bound in the plan, over the bound's range"),
         *(

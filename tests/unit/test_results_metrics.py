@@ -142,6 +142,14 @@ def test_the_share_of_plans_that_end_in_the_terminal_set_is_told_where_there_is_
     assert control_metrics(rows, scenario(), UNITS)["control.terminal_inside"] == 0.5
 
 
+def test_the_time_between_measurement_and_input_is_told_where_it_is_known(frame: pd.DataFrame) -> None:
+    assert not [name for name in control_metrics(frame, scenario(), UNITS) if "feedback" in name]
+    timed = frame.assign(**{"controller.feedback_time": 2e-4})
+    metrics = control_metrics(timed, scenario(), UNITS)
+    assert metrics["control.feedback_ms_median"] == pytest.approx(0.2)
+    assert metrics["control.feedback_ms_p99"] == pytest.approx(0.2)
+
+
 def test_solves_longer_than_the_sampling_time_miss_their_deadline(frame: pd.DataFrame) -> None:
     late = frame.copy()
     late.loc[20:49, "controller.solve_time"] = 0.011  # three samples

@@ -35,7 +35,8 @@ typedef struct {
     int planned, left;
     double plan_x[HORIZON + 1][N_X], plan_u[HORIZON][N_U];
     int referenced;
-    Reference_ reference;
+    int prepared;                  /* whether the coming tick is, and is begun from these: */
+    Reference_ reference, coming; /* of the last tick and of the coming one */
     int believed;
     double mean[N_Z], covariance[N_Z][N_Z];
     int applied_known;
@@ -56,6 +57,7 @@ typedef struct {
     Memory now, following;
     int fresh; /* whether the outputs answer the present measurements */
     int due;   /* whether the present communication point is a tick */
+    int ready; /* whether the solver is prepared for it */
     int mode;
 } State;
 
@@ -633,7 +635,8 @@ static void shift_plan(const double *x, const double *u, const double *force, Me
     memcpy(to->plan_u[HORIZON - 1], held, sizeof held);
 }
 
-static void solve(State *s, const Memory *m, const Reference_ *reference, const double *state)
+/* What the solver works with, but for the measured state. */
+static void put_problem(State *s, const Memory *m, const Reference_ *reference)
 {
     double x[(HORIZON + 1) * N_X], u[HORIZON * N_U], p[N_P + N_Q], last[N_U];
     for (int k = 0; k <= HORIZON; k++) {
@@ -655,8 +658,54 @@ static void solve(State *s, const Memory *m, const Reference_ *reference, const 
     if (m->planned) {
         put(s, "x", m->plan_x, (HORIZON + 1) * N_X), put(s, "u", m->plan_u, HORIZON * N_U);
     }
+}
+
+/* The solution from a state, by what is prepared where anything is. */
+static void solve(State *s, const Memory *m, const Reference_ *reference, const double *state)
+{
+    nmpc *head = solver(s);
+    const int prepared = head->real_time && m->prepared;
+    if (!prepared || !s->ready) {
+        put_problem(s, m, reference);
+    }
+    if (prepared) {
+        if (!s->ready) {
+            nmpc_prepare(head, &MODEL);
+        }
+        s->ready = 0; /* it is used up */
+        put(s, "x0", state, N_X);
+        nmpc_feedback(head, &MODEL);
+        nmpc_finish(head, &MODEL);
+        if (head->status != NMPC_FAILED) {
+            return;
+        }
+        put_problem(s, m, reference);
+    }
     put(s, "x0", state, N_X);
-    nmpc_solve(solver(s), &MODEL, m->planned);
+    nmpc_solve(head, &MODEL, m->planned);
+}
+
+/* What needs no measurements of the coming tick, as `_prepare` in control/controller.py. */
+static void prepare(State *s)
+{
+    Memory *m = &s->now;
+    m->prepared = m->believed && m->planned && m->decided && m->applied_known;
+    if (!m->prepared) {
+        return;
+    }
+    double mean[N_Z], P[N_Z][N_Z], force[N_Q];
+    memcpy(mean, m->mean, sizeof mean), memcpy(P, m->covariance, sizeof P);
+    if (LATE) {
+        predict(mean, P, m->applied);
+    }
+    force_of(mean, force);
+    refer(&m->coming, m->referenced ? &m->reference : NULL, m->time + (SLOW ? SAMPLE : 0.0), mean, m->branch, force);
+    memcpy(m->plan_x[0], mean, sizeof m->plan_x[0]);
+    if (solver(s)->real_time) {
+        put_problem(s, m, &m->coming);
+        nmpc_prepare(solver(s), &MODEL);
+    }
+    s->ready = 1;
 }
 
 /* What the coming tick's outputs are, and what follows it. */
@@ -682,7 +731,11 @@ static void tick(State *s)
         branch[r] = m->decided ? m->branch[r]
                     : FOLLOWED[r].through == YOKE ? (int)floor(state[FOLLOWED[r].state] / PI) : 0;
     }
-    refer(&f->reference, m->referenced ? &m->reference : NULL, m->time + (SLOW ? SAMPLE : 0.0), state, branch, force);
+    if (m->prepared) {
+        f->reference = m->coming;
+    } else {
+        refer(&f->reference, m->referenced ? &m->reference : NULL, m->time + (SLOW ? SAMPLE : 0.0), state, branch, force);
+    }
     double x0[N_X];
     for (int i = 0; i < N_X; i++) {
         x0[i] = known ? state[i] : NAN;
@@ -809,7 +862,7 @@ static void start_core(State *s)
     memset(&s->now, 0, sizeof s->now);
     s->now.time = s->values[TIME];
     s->due = 1;
-    s->fresh = 0;
+    s->fresh = s->ready = 0;
     begin_solver(s);
 }
 
@@ -849,6 +902,7 @@ static void pass(State *s, double h)
     if (s->due) {
         s->now = s->following;
         s->due = 0;
+        prepare(s);
     }
     while (s->now.time <= end + instant) {
         move(s, s->now.time - at);
@@ -861,6 +915,7 @@ static void pass(State *s, double h)
         }
         tick(s);
         s->now = s->following;
+        prepare(s);
     }
     move(s, s->due ? 0.0 : end - at);
     s->values[TIME] = end;
