@@ -204,10 +204,7 @@ def simulate(work: Run, resume: bool = False) -> None:
     store = store_of(work, span, key, resume)
     result = cosimulate(work, components, scenario.connection_list(), span, starts, store)
     stem = work.folder / "trajectories"
-    if result.rows is None:
-        written = write_table(stem, result.frame, result.units)
-    else:
-        written = write_rows(stem, list(map(str, result.frame)), result.units, result.rows.blocks())
+    written = write_rows(stem, result.frames(), result.units)
     if result.rows is not None and len(result.frame) < result.rows.rows:
         share = round(result.rows.rows / len(result.frame))
         work.warn(f"metrics and figures are made of every {share}th of {result.rows.rows} rows")

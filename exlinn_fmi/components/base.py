@@ -30,7 +30,7 @@ Variability = Literal["constant", "fixed", "tunable", "discrete", "continuous"]
 VariableType = Literal["Real", "Integer", "Boolean", "Enumeration", "String", "Binary"]
 
 TEXT_TYPES: tuple[VariableType, ...] = ("String", "Binary")
-"""Types whose values are numbers that stand for texts; tables of numbers do not hold them."""
+"""Types whose values are numbers that stand for texts, see `components.texts`."""
 
 Values = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -50,6 +50,7 @@ import numpy as np
 from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
 from exlinn_fmi.components.packing import pack, unpack
 from exlinn_fmi.components.starts import check_starts, takes_start
+from exlinn_fmi.components.texts import handle, text
 from exlinn_fmi.errors import ExlinnError, InputError, nearest
 
 
@@ -103,8 +104,12 @@ class PythonComponent(Component):
     def __getitem__(self, name: str) -> float:
         return float(self.values[self._index[name]])
 
-    def __setitem__(self, name: str, value: float) -> None:
-        self.values[self._index[name]] = value
+    def __setitem__(self, name: str, value: float | str | bytes) -> None:
+        self.values[self._index[name]] = handle(value) if isinstance(value, str | bytes) else value
+
+    def text(self, name: str) -> str | bytes:
+        """The value of a variable of type String or Binary."""
+        return text(self[name])
 
     # ── the contract ─────────────────────────────────────────────────────────────────────────────────────
 

@@ -15,7 +15,7 @@ References: FMI 2.0 §4.2.1; Kübler and Schiehlen, "Two methods of simulator co
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,7 @@ import numpy as np
 
 from exlinn_fmi.components.base import Component, Values
 from exlinn_fmi.cosim.adaptive import Adaptive, AdaptiveOptions
+from exlinn_fmi.cosim.columns import Columns, Kind, kind_of
 from exlinn_fmi.cosim.extrapolation import ExtrapolationOptions
 from exlinn_fmi.cosim.graph import Graph
 from exlinn_fmi.cosim.loops import SOLVERS, LoopOptions
@@ -59,6 +60,7 @@ class Trajectories:
             run that is paced, ``late_steps`` and ``longest_step`` [s] of its components, by name;
             ``communication_steps``, ``rejected_steps``, ``inexact_steps`` (kept in spite
             of their error) and ``shortest_step`` [s] where steps are adaptive.
+        columns: what the numbers of a row stand for.
         rows: all rows, where the run has a store.
     """
 
@@ -66,7 +68,15 @@ class Trajectories:
     units: dict[str, str]
     error: RunError | None
     statistics: dict[str, Any]
+    columns: Columns
     rows: RowFile | None = None
+
+    def frames(self) -> Iterator[pd.DataFrame]:
+        """All rows, some at a time where they are in a store; at least one frame."""
+        if self.rows is None or not self.rows.rows:
+            yield self.frame
+        else:
+            yield from map(self.columns.frame, self.rows.blocks())
 
 
 class Master:
@@ -191,7 +201,9 @@ class Master:
         if self._profile:
             seconds = self._seconds(components).tolist()
             statistics["component_seconds"] = dict(zip(self.graph.names, seconds, strict=True))
-        return Trajectories(recorder.frame(), recorder.units, error, statistics, recorder.file)
+        return Trajectories(
+            recorder.frame(), recorder.units, error, statistics, recorder.columns, recorder.file
+        )
 
     def _seconds(self, components: Sequence[Component]) -> Values:
         """For how long each component has been at work [s]."""
@@ -204,7 +216,10 @@ class Master:
         stated = ["s", *(self.graph.variable(port).unit for port in self.recorded), *("s" for _ in timing)]
         units = {name: unit for name, unit in zip(names, stated, strict=True) if unit is not None}
         file = None if store is None else store.row_file(self.ticks // self._every + 1, len(names))
-        return Recorder(names, units, self.ticks, self._every, file)
+        variables = [self.graph.variable(port) for port in self.recorded]
+        kinds: list[Kind] = ["number", *map(kind_of, variables)]
+        kinds += ["number"] * len(timing)
+        return Recorder(names, units, self.ticks, self._every, file, kinds)
 
     def _attempt(
         self, plan: Plan, recorder: Recorder, starts: Mapping[str, Mapping[str, float]], watch: Watch

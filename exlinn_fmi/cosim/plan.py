@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from exlinn_fmi.components.base import Component, Indices, Status, Values
+from exlinn_fmi.components.texts import keep, kept
 from exlinn_fmi.cosim.exchange import Advance, Exchange, Warned
 from exlinn_fmi.cosim.extrapolation import Extrapolation, ExtrapolationOptions
 from exlinn_fmi.cosim.graph import Graph
@@ -323,6 +324,7 @@ class Plan:
         warnings = {name: [warned.count, warned.first] for name, warned in self.warnings.items()}
         return {
             "components": states,
+            "texts": kept(),
             "signals": self.signals,
             "ahead": self.ahead,
             "warnings": warnings,
@@ -332,6 +334,7 @@ class Plan:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from what `save` gave, in components that are initialised alike."""
+        keep(state["texts"])
         for name, component in zip(self.graph.names, self.components, strict=True):
             component.restore_state(component.deserialize_state(state["components"][name]))
         self.signals[:], self.ahead[:] = state["signals"], state["ahead"]

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from exlinn_fmi.components.base import TEXT_TYPES, Component, Indices, Values
+from exlinn_fmi.components.base import Component, Indices, Values
+from exlinn_fmi.cosim.columns import Columns, Kind
 from exlinn_fmi.cosim.order import Port
 from exlinn_fmi.cosim.store import RowFile
 from exlinn_fmi.errors import InputError, nearest
@@ -27,7 +28,7 @@ def select(components: Mapping[str, Component], patterns: Iterable[str]) -> list
     A pattern without ``*`` and ``?`` is the name of one variable of any causality. ``*`` alone stands for all
     inputs and outputs. Other patterns stand for all inputs, outputs and local variables whose
     ``component.variable`` fits, so ``plant.*`` adds the locals of one component; parameters, which stay as
-    they are, are recorded only where named in full. Texts are not recorded.
+    they are, are recorded only where named in full.
 
     Args:
         components: by name.
@@ -45,17 +46,13 @@ def select(components: Mapping[str, Component], patterns: Iterable[str]) -> list
     problems = []
     for pattern in patterns:
         found = [paths[pattern]] if pattern in paths else []
-        if found and parts[found[0][0]].variables[found[0][1]].type in TEXT_TYPES:
-            problems.append(f"record: {pattern} is a text; tables hold numbers only")
         if not found and ("*" in pattern or "?" in pattern):
             causalities = ("input", "output") if pattern == "*" else ("input", "output", "local")
             fits = re.compile(_expression(pattern)).fullmatch
             found = [
                 port
                 for path, port in paths.items()
-                if (v := parts[port[0]].variables[port[1]]).causality in causalities
-                and v.type not in TEXT_TYPES
-                and fits(path)
+                if parts[port[0]].variables[port[1]].causality in causalities and fits(path)
             ]
         if not found and pattern != "*":
             problems.append(f"record: nothing fits {pattern!r}; {nearest(pattern, paths, 'variables')}")
@@ -79,8 +76,10 @@ class Recorder:
         ticks: number of the last communication point.
         every: a row is recorded at each tick that is a multiple of it.
         file: where rows go; without it they stay in memory.
+        kinds: what each column holds; numbers if not given.
 
     Attributes:
+        columns: what they stand for.
         table: (rows, columns), filled from the top by whoever steps.
         rows: how many rows are recorded in all.
         base: number of the row that the table begins with.
@@ -96,8 +95,9 @@ class Recorder:
         ticks: int,
         every: int = 1,
         file: RowFile | None = None,
+        kinds: Sequence[Kind] = (),
     ) -> None:
-        self.names, self.units, self.every, self.file = list(names), dict(units), every, file
+        self.columns, self.units, self.every, self.file = Columns(names, kinds), dict(units), every, file
         self.rows = self.base = 0
         rows = ticks // every + 1
         try:
@@ -151,9 +151,7 @@ class Recorder:
 
     def frame(self) -> pd.DataFrame:
         """The rows as a frame; of more than fit well into memory, every n-th."""
-        import pandas as pd
-
         if self.file is not None:
-            return pd.DataFrame(self.file.thinned(), columns=self.names)
+            return self.columns.frame(self.file.thinned())
         # The copy of a run that ended early does not hold the memory of the rows that it lacks.
-        return pd.DataFrame(self.table[: self.rows], columns=self.names, copy=self.rows < len(self.table))
+        return self.columns.frame(self.table[: self.rows], copy=self.rows < len(self.table))

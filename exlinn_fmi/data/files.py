@@ -3,7 +3,8 @@
 A table is three files: ``stem.csv`` (for people and other tools), ``stem.parquet`` (fast, units inside) and
 ``stem.meta.json`` (units beside the CSV). The CSV has one header line, plain numbers in the shortest form
 that reads back as the same float64, booleans as 0/1, ``nan``/``inf`` where a value is not finite, no blanks
-and no comment lines; names that hold a comma are quoted. FMPy, OMSimulator and pandas read it.
+and no comment lines; names that hold a comma are quoted. FMPy, OMSimulator and pandas read it. Of recorded
+texts ``stem.texts.csv`` tells when they changed; the Parquet file has them in columns.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import csv
 import errno
 import hashlib
 import io
+import itertools
 import json
 import math
 import os
@@ -23,7 +25,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from exlinn_fmi.errors import DataError, StorageError
 
@@ -157,63 +158,76 @@ def write_table(stem: Path, frame: pd.DataFrame, units: Mapping[str, str]) -> li
     Raises:
         StorageError: one of the files could not be written; none is replaced then.
     """
-    import pyarrow as pa
-
-    columns = {str(name): _column(frame[name]) for name in frame.columns}
-    schema = _schema({name: column.type for name, column in columns.items()}, units)
-    return _write_tables(stem, schema, [pa.table(list(columns.values()), schema=schema)])
+    return _write_tables(stem, [frame], units, texts_apart=False)
 
 
-def write_rows(
-    stem: Path, names: Sequence[str], units: Mapping[str, str], blocks: Iterable[NDArray[np.float64]]
-) -> list[Path]:
-    """Write the files of `write_table` block by block, so that only one block is in memory at a time.
+def write_rows(stem: Path, frames: Iterable[pd.DataFrame], units: Mapping[str, str]) -> list[Path]:
+    """Write the files of `write_table` frame by frame, so that only one is in memory at a time.
+
+    Columns of texts and binaries are in the Parquet file only; ``stem.texts.csv`` tells of each what it is at
+    first and whenever it has changed: ``time,variable,text``, binaries in hexadecimal digits.
 
     Args:
         stem: path without suffix.
-        names: names of the columns.
+        frames: rows in order, at least one frame, all with the same columns; the first is the time.
         units: unit by column name; columns without one may be left out.
-        blocks: rows (n, columns) in order.
 
     Returns:
-        The paths of the three files.
+        The paths of the files.
 
     Raises:
         StorageError: one of the files could not be written; none is replaced then.
     """
+    return _write_tables(stem, frames, units, texts_apart=True)
+
+
+def _write_tables(
+    stem: Path, frames: Iterable[pd.DataFrame], units: Mapping[str, str], texts_apart: bool
+) -> list[Path]:
+    """Write frames one after the other into the files of a table."""
+    tables = (_table(frame, units) for frame in frames)
+    first = next(tables)
+    texts = [f.name for f in first.schema if texts_apart and not _is_number(f.type)]
+    paths = [_beside(stem, suffix) for suffix in (".csv", ".parquet", ".meta.json", ".texts.csv")]
+    spare = paths[3:] if not texts else []
+    paths = paths[: 4 - len(spare)]
+    numbers = first.drop_columns(texts).schema
+    with whole(*paths) as files:
+        with (
+            csv_file(files[0], numbers) as to_csv,
+            parquet_file(files[1], first.schema) as to_parquet,
+            texts_file(files[-1], texts) as to_texts,
+        ):
+            for table in itertools.chain([first], tables):
+                to_csv(table.drop_columns(texts))
+                to_parquet(table)
+                to_texts(table)
+        known = {f.name: f.metadata[UNIT].decode() for f in first.schema if f.metadata}
+        files[2].write_text(json.dumps({"units": known}, indent=2, ensure_ascii=False) + "\n", "utf-8")
+    for path in spare:
+        path.unlink(missing_ok=True)  # of an earlier run
+    return paths
+
+
+def _table(frame: pd.DataFrame, units: Mapping[str, str]) -> pa.Table:
+    """A frame as an Arrow table, units inside."""
     import pyarrow as pa
 
-    schema = _schema(dict.fromkeys(names, pa.float64()), units)
-    tables = (
-        pa.table([pa.array(np.ascontiguousarray(column)) for column in block.T], schema=schema)
-        for block in blocks
-    )
-    return _write_tables(stem, schema, tables)
-
-
-def _schema(types: Mapping[str, pa.DataType], units: Mapping[str, str]) -> pa.Schema:
-    """Arrow's description of a table, units inside."""
-    import pyarrow as pa
-
-    return pa.schema(
+    columns = {str(name): _column(frame[name]) for name in frame.columns}
+    schema = pa.schema(
         [
-            pa.field(name, kind, metadata={UNIT: units[name].encode()} if name in units else None)
-            for name, kind in types.items()
+            pa.field(name, column.type, metadata={UNIT: units[name].encode()} if name in units else None)
+            for name, column in columns.items()
         ]
     )
+    return pa.table(list(columns.values()), schema=schema)
 
 
-def _write_tables(stem: Path, schema: pa.Schema, tables: Iterable[pa.Table]) -> list[Path]:
-    """Write Arrow tables one after the other into the three files of a table."""
-    paths = [_beside(stem, suffix) for suffix in (".csv", ".parquet", ".meta.json")]
-    with whole(*paths) as files:
-        with csv_file(files[0], schema) as to_csv, parquet_file(files[1], schema) as to_parquet:
-            for table in tables:
-                to_csv(table)
-                to_parquet(table)
-        known = {f.name: f.metadata[UNIT].decode() for f in schema if f.metadata}
-        files[2].write_text(json.dumps({"units": known}, indent=2, ensure_ascii=False) + "\n", "utf-8")
-    return paths
+def _is_number(kind: pa.DataType) -> bool:
+    """Whether values of an Arrow type are numbers or booleans."""
+    import pyarrow as pa
+
+    return not (pa.types.is_string(kind) or pa.types.is_binary(kind))
 
 
 def read_table(stem: Path) -> tuple[pd.DataFrame, dict[str, str]]:
@@ -265,6 +279,8 @@ def _column(series: pd.Series[Any]) -> pa.Array:
     values = series.to_numpy()
     if values.dtype.kind in "bifu":
         return pa.array(values, from_pandas=False)
+    if len(values) and isinstance(values[0], bytes):
+        return pa.array(values, pa.binary())
     return pa.array(["" if v is None or v != v else str(v) for v in values], pa.string())
 
 
@@ -284,6 +300,35 @@ def csv_file(file: Path, schema: pa.Schema) -> Iterator[Callable[[pa.Table], Non
         def append(table: pa.Table) -> None:
             with _named(file):
                 pyarrow.csv.write_csv(table.cast(pa.schema(plain)), stream, options)
+
+        yield append
+
+
+@contextmanager
+def texts_file(file: Path, names: Sequence[str]) -> Iterator[Callable[[pa.Table], None]]:
+    """A CSV file of when texts change, nothing where there are none; gives what appends a table's to it."""
+    if not names:
+        yield lambda table: None
+        return
+    last: dict[str, Any] = {}
+    with _named(file), file.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(["time", "variable", "text"])
+
+        def append(table: pa.Table) -> None:
+            rows = []
+            for place, name in enumerate(names):
+                values = table.column(name).to_pylist()
+                changed = (
+                    k for k, value in enumerate(values) if value != (values[k - 1] if k else last.get(name))
+                )
+                rows += [(k, place, values[k]) for k in changed]
+                last[name] = values[-1] if values else last.get(name)
+            times = table.column(0)
+            with _named(file):
+                for k, place, value in sorted(rows, key=lambda row: row[:2]):
+                    shown = value.hex() if isinstance(value, bytes) else value
+                    writer.writerow([times[k].as_py(), names[place], shown])
 
         yield append
 

@@ -195,6 +195,8 @@ def recorded(survey: Survey) -> Iterator[Finding]:
         if simulate is not None and variable is not None:
             recorded = any(records(pattern, output, variable) for pattern in patterns)
             problem = None if recorded else f"{output} is not recorded; add it to simulate.record"
+            if variable.type in TEXT_TYPES:
+                problem = f"{output} is a text; metrics are of numbers"
         if problem:
             yield ("metrics", "output", k) if several else ("metrics", "output"), problem
 
@@ -208,8 +210,6 @@ def records(pattern: str, path: str, variable: Variable) -> bool:
     if pattern == path:
         return True
     kinds = ("input", "output") if pattern == "*" else ("input", "output", "local")
-    if variable.type in TEXT_TYPES:
-        return False
     return variable.causality in kinds and fnmatchcase(path, pattern.replace("[", "[[]"))
 
 

@@ -73,13 +73,12 @@ def test_whole_numbers_beyond_what_float64_holds_are_rounded_with_a_warning(tmp_
     assert values[0] == 2.0**53 + 2
 
 
-def test_texts_are_connected_and_not_recorded(tmp_path: Path) -> None:
+def test_texts_are_connected(tmp_path: Path) -> None:
     parts = [(tmp_path / name) for name in ("a", "b")]
     for part in parts:
         part.mkdir()
     graph = {p.name: FmuComponent(p.name, feedthrough(p)) for p in parts}
     master = Master(Graph(graph, [("a.String_out", "b.String_in")]), 0.0, 1.0, 0.1)
-    assert not any("String" in path or "Binary" in path for path in map(master.graph.path, master.recorded))
     seen = []
     get = graph["b"].get
 
@@ -91,11 +90,11 @@ def test_texts_are_connected_and_not_recorded(tmp_path: Path) -> None:
         return status
 
     graph["b"].get = watch  # type: ignore[method-assign]
-    result = master.run({"a": {"String_in": handle("hello")}})
+    result = master.run({"a": {"String_in": handle("hello"), "Binary_in": handle(b"\0\xff")}})
     assert result.error is None
     assert seen[-1] == "hello"
-    with pytest.raises(InputError, match="is a text; tables hold numbers only"):
-        Master(master.graph, 0.0, 1.0, 0.1, record=["a.String_out"])
+    assert result.frame["b.String_in"].tolist() == ["hello"] * 11
+    assert result.frame["a.Binary_out"].tolist() == [b"\0\xff"] * 11
     with pytest.raises(InputError, match="types do not fit, String into Real"):
         Graph(graph, [("a.String_out", "b.u[1]")])
 
@@ -259,7 +258,14 @@ def test_a_scenario_sizes_arrays_gives_texts_and_asks_for_model_exchange(
     assert frame["ball.h"].to_numpy() == pytest.approx([ball(0.1 * k)[0] for k in range(11)], abs=1e-7)
     assert frame["all.u[1]"].equals(frame["ball.h"])
     assert frame["all.y[1]"].iloc[0] == 1 * 1 + 2 * 2 + 4 * 3
-    assert not [name for name in frame if "String" in name]
+    assert not [name for name in frame if "String" in name or "Binary" in name]
+    table = pd.read_parquet(work.folder / "trajectories.parquet")
+    assert table["all.String_out"].tolist() == ["text"] * 11
+    assert table["all.Binary_out"].tolist() == [b"\x0a\xff"] * 11
+    told = pd.read_csv(work.folder / "trajectories.texts.csv", dtype=str)
+    assert ["0.0", "all.String_out", "text"] in told.to_numpy().tolist()
+    assert ["0.0", "all.Binary_in", "0aff"] in told.to_numpy().tolist()
+    assert len(told) == 8  # once each: nothing changes
 
 
 @pytest.mark.parametrize(

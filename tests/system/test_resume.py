@@ -95,6 +95,53 @@ def test_a_killed_run_goes_on_to_the_same_last_bit(tmp_path: Path):
     assert not (out / "simulate.part").exists()
 
 
+TEXTS = """
+import os, signal
+from exlinn_fmi import PythonComponent, Variable
+
+class Phases(PythonComponent):
+    variables = (Variable("name", "output", "discrete", type="String", depends_on=()),)
+
+    def outputs(self, t):
+        self["name"] = f'phase {int(t / 0.4 + 1e-9)}, "öffnen"'
+
+    def advance(self, t, h):
+        if t > 1.0 and not os.path.exists("again"):
+            open("again", "w").close()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+class Reader(PythonComponent):
+    variables = (Variable("given", "input", "discrete", type="String"), Variable("length", "output"))
+
+    def outputs(self, t):
+        self["length"] = float(len(self.text("given")))
+"""
+
+
+@pytest.mark.parametrize("stream", ["false", "true"])
+def test_texts_that_change_are_recorded_also_by_a_run_that_goes_on_after_it_was_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stream: str
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "parts.py").write_text(TEXTS)
+    file = tmp_path / "texts.yaml"
+    file.write_text(
+        "name: texts\ncomponents: {a: {python: 'parts:Phases'}, b: {python: 'parts:Reader'}}\n"
+        "connections: {a.name: b.given}\n"
+        f"simulate: {{stop: 2, step: 0.1, stream: {stream}, checkpoint: 1e-9}}\n"
+    )
+    assert start(file, tmp_path / "out").wait(timeout=60) < 0
+    assert start(file, tmp_path / "out", "--resume").wait(timeout=60) == 0
+    table = pd.read_parquet(tmp_path / "out" / "trajectories.parquet")
+    expected = [f'phase {int(0.1 * k / 0.4 + 1e-9)}, "öffnen"' for k in range(21)]
+    assert table["a.name"].tolist() == table["b.given"].tolist() == expected
+    assert list(pd.read_csv(tmp_path / "out" / "trajectories.csv")) == ["time", "b.length"]
+    told = pd.read_csv(tmp_path / "out" / "trajectories.texts.csv")
+    changes = told[told["variable"] == "b.given"]
+    assert changes["time"].tolist() == pytest.approx([0.0, 0.4, 0.8, 1.2, 1.6, 2.0])
+    assert changes["text"].tolist() == list(dict.fromkeys(expected))
+
+
 def test_without_a_checkpoint_there_is_nothing_to_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     file = write(tmp_path, "start: 0.0")
     assert exit_code(["simulate", str(file), "--out", str(tmp_path / "out"), "--resume"]) == 1
