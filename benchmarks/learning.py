@@ -41,6 +41,7 @@ from threadpoolctl import threadpool_limits
 from exlinn_fmi import pipeline
 from exlinn_fmi.data.dataset import Dataset, Samples, required_columns
 from exlinn_fmi.data.files import write_json
+from exlinn_fmi.learn.adjoint import Adjoint
 from exlinn_fmi.learn.assembly import inverse_assembly
 from exlinn_fmi.learn.card import force_error
 from exlinn_fmi.learn.identify import identify
@@ -163,12 +164,12 @@ def gradient_ratio(bench: Bench) -> float:
     batch = theirs.batch(samples)
 
     expected = networks.pack({name: g.numpy() for name, g in theirs.gradient(*batch).items()})
-    found = networks.gradient(theta, data)[1]
+    ours = Adjoint(networks, data)
+    found = ours.mean_square(theta)[1]
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
     rounds = range(3 if bench.quick else 20)
     pairs = [
-        (_seconds(lambda: theirs.gradient(*batch)), _seconds(lambda: networks.gradient(theta, data)))
-        for _ in rounds
+        (_seconds(lambda: theirs.gradient(*batch)), _seconds(lambda: ours.mean_square(theta))) for _ in rounds
     ]
     return median(a / b for a, b in pairs)
 

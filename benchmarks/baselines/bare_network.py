@@ -41,16 +41,16 @@ def bare_network(data: Dataset, seed: int, iterations: int) -> LagrangianSystem:
     direct = slice(1, spec.layout.basis - spec.layout.hidden)
     masks = spec.layout.free
     masks["lagrangian.output"][:, direct] = False
-    chosen = networks.pack_mask(masks)
+    part = StructuredNetworks(spec, networks.pack_mask(masks))
     weights = {name: w.copy() for name, w in start.weights.items()}
     output, random = weights["lagrangian.output"], np.random.default_rng(seed)
     output[:, direct.stop :] = (
         FIRST * np.abs(output[:, :1]).max() * random.standard_normal((len(output), HIDDEN))
     )
     samples = inverse_assembly(spec, data.arrays).part(slice(None, None, EVERY))
-    objective = Objective(Inverse(networks, samples), DECAY, chosen)
-    best = networks.pack(weights)[chosen]
+    objective = Objective(Inverse(part, samples), DECAY)
+    best = part.pack(weights)
     descent = levenberg_marquardt(best, objective.linearise, objective.value, FLOOR)
     for step, _ in zip(descent, range(iterations), strict=False):
         best = step.theta
-    return learned_system(spec, networks.unpack(objective.full(best)))
+    return learned_system(spec, part.unpack(best))

@@ -45,8 +45,8 @@ class ReportCard:
             (``name_learned``).
         units: units of the evaluation's columns.
         texts: ``learn.guarantee``: whether bounded inputs keep the model bounded; ``learn.objective``,
-            ``learn.terms`` and ``identify.objective``: what was done and why, and the formula that was found,
-            as far as there is any.
+            ``learn.optimiser``, ``learn.terms`` and ``identify.objective``: what was done and why, and the
+            formula that was found, as far as there is any.
         terms: the terms that were found, if the model is made of such.
         curves: M(q), V(q), 1/C(x) and friction over velocity with 95 % bands, as `curves.curves` gives them.
     """
@@ -101,8 +101,8 @@ def report_card(
         coefficients = np.concatenate([model.weights[name] for name in names])
         terms = term_table(model.spec, coefficients, np.array(model.provenance["deviations"]))
         texts["learn.terms"] = formula(terms)
-    if "objective" in model.provenance:
-        texts["learn.objective"] = model.provenance["objective"]
+    told_of = [name for name in ("objective", "optimiser") if name in model.provenance]
+    texts |= {f"learn.{name}": model.provenance[name] for name in told_of}
     evaluation, units = _evaluation(system, (tests or [train])[0])
     metrics |= _identify_metrics(found)
     return ReportCard(metrics, found.parameters, evaluation, units, texts, terms, curves(model, train))

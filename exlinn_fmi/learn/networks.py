@@ -40,16 +40,23 @@ class StructuredNetworks:
 
     Args:
         spec: the model.
-        chosen: which of its free weights θ has, the others being 0; all if not given.
+        chosen: which of its free weights θ has; all if not given.
+        held: values of all free weights, those in θ aside; 0 if not given.
     """
 
     spec: ModelSpec
     chosen: NDArray[np.bool_] | None = field(default=None, compare=False)
+    held: Float[Array, " F"] | None = field(default=None, compare=False)
+
+    @cached_property
+    def _every(self) -> NDArray[np.bool_]:
+        """Which of all weights are free."""
+        return np.concatenate([mask.ravel() for mask in self.spec.layout.free.values()])
 
     @cached_property
     def _free(self) -> NDArray[np.bool_]:
         """Which of all weights, one after the other, are in θ."""
-        free = np.concatenate([mask.ravel() for mask in self.spec.layout.free.values()])
+        free = self._every.copy()
         if self.chosen is not None:
             free[free] = self.chosen
         return free
@@ -72,6 +79,8 @@ class StructuredNetworks:
     def unpack(self, theta: Float[Array, " P"]) -> dict[str, Array]:
         """Weight arrays by name."""
         full = np.zeros(self._free.shape)
+        if self.held is not None:
+            full[self._every] = self.held
         full[self._free] = theta
         return {name: full[part].reshape(shape) for name, (part, shape) in self._places.items()}
 
@@ -93,17 +102,24 @@ class StructuredNetworks:
         basis, slopes = self.basis(weights, data)
         outputs, gradients = _outputs(weights, basis, slopes)
         f, df = self._terms(outputs, gradients)
-        residual = np.einsum("bnt,bt->bn", data.value, f) - data.target
+        other, slip = self.others(weights, data)
+        residual = np.einsum("bnt,bt->bn", data.value, f) + other
         residual += np.einsum("bntz,btz->bn", data.gradient, df)
-        residual += coupling_columns(self.spec.layout, data.velocity) @ weights["lagrangian.coupling"]
-        residual += weights["dissipation.viscous"] ** 2 * data.velocity
-        residual -= weights["lagrangian.offset"] * data.push
+        return _Forward(basis, slopes, outputs, gradients, slip, residual)
+
+    def others(
+        self, weights: dict[str, Array], data: Assembly
+    ) -> tuple[Float[Array, "B n"], tuple[Float[Array, "B n k"], Float[Array, "B n k"]]]:
+        """What is no function of position: coupling, friction, offsets, less the forces; and `_slip`."""
+        force = coupling_columns(self.spec.layout, data.velocity) @ weights["lagrangian.coupling"]
+        force += weights["dissipation.viscous"] ** 2 * data.velocity
+        force -= weights["lagrangian.offset"] * data.push + data.target
         a, s = weights["dissipation.friction"], friction_width(weights)
         slip = self._slip(data.velocity[:, :, None] / s)
-        residual += np.einsum("nk,bnk->bn", a**2 * s, slip[0])
+        force += np.einsum("nk,bnk->bn", a**2 * s, slip[0])
         if self.spec.layout.drag:
-            residual += weights["dissipation.quadratic"] ** 2 * data.velocity * np.abs(data.velocity)
-        return _Forward(basis, slopes, outputs, gradients, slip, residual)
+            force += weights["dissipation.quadratic"] ** 2 * data.velocity * np.abs(data.velocity)
+        return force, slip
 
     def _slip(self, x: Float[Array, "B n k"]) -> tuple[Float[Array, "B n k"], Float[Array, "B n k"]]:
         """Force of each friction unit at q̇/s, and its derivative: tanh x, and x exp(−x²/2) for Stribeck's."""
@@ -192,71 +208,6 @@ class StructuredNetworks:
 
     # ── derivatives ──────────────────────────────────────────────────────────────────────────────────────
 
-    def gradient(self, theta: Float[Array, " P"], data: Assembly) -> tuple[float, Float[Array, " P"]]:
-        """Mean square of the residual and its gradient by θ, in one pass back: no Jacobian is made."""
-        weights, layout = self.unpack(theta), self.spec.layout
-        forward = self._forward(weights, data)
-        pull = 2 / forward.residual.size * forward.residual
-        value, slope = self._pull_terms(
-            forward,
-            np.einsum("bnt,bn->bt", data.value, pull),
-            np.einsum("bntz,bn->btz", data.gradient, pull),
-        )
-        power = pull.T @ data.velocity  # (n, n)
-        parts = {
-            "lagrangian.output": value.T @ forward.basis
-            + np.tensordot(slope, forward.slopes, axes=((0, 2), (0, 2))),
-            "lagrangian.coupling": np.array([power[i, j] - power[j, i] for i, j in layout.couplings]),
-            "lagrangian.offset": -(pull * data.push).sum(axis=0),
-            "dissipation.viscous": 2 * weights["dissipation.viscous"] * np.diag(power),
-            **self._pull_hidden(weights, forward, data, value, slope),
-            **_pull_friction(weights, forward, data, pull),
-        }
-        return float(np.vdot(forward.residual, forward.residual)) / pull.size, self.pack(parts)
-
-    def _pull_terms(
-        self, forward: _Forward, f: Float[Array, "B T"], df: Float[Array, "B T nz"]
-    ) -> tuple[Float[Array, "B O"], Float[Array, "B O nz"]]:
-        """Derivatives by each output's value and gradient, from those by the functions f_t and ∂f_t/∂z."""
-        layout, rows = self.spec.layout, self.spec.layout.rows
-        value, slope = np.zeros(forward.outputs.shape), np.zeros(forward.gradients.shape)
-        for t, (kind, i, j) in enumerate(layout.terms):
-            if kind != "M":
-                row = layout.outputs.index((kind, i, j))
-                value[:, row] += f[:, t]
-                slope[:, row] += df[:, t]
-                continue
-            share = 2 if i == j else 1
-            by_value, by_gradient = share * f[:, t, None], share * df[:, t, None]
-            for one, other in [(rows[i], rows[j])] + [(rows[j], rows[i])] * (i != j):
-                value[:, one] += by_value * forward.outputs[:, other]
-                value[:, one] += np.einsum("bcz,bz->bc", forward.gradients[:, other], by_gradient[:, 0])
-                slope[:, one] += forward.outputs[:, other, None] * by_gradient
-        return value, slope
-
-    def _pull_hidden(
-        self,
-        weights: dict[str, Array],
-        forward: _Forward,
-        data: Assembly,
-        value: Float[Array, "B O"],
-        slope: Float[Array, "B O nz"],
-    ) -> dict[str, Array]:
-        """Derivatives by the hidden layer's weights, from those by the outputs."""
-        start = self.spec.layout.basis - self.spec.layout.hidden
-        w, out = (
-            weights["lagrangian.hidden.weight"],
-            weights["lagrangian.output"][:, start:],
-        )  # (h, nz), (O, h)
-        tanh = forward.basis[:, start:]
-        first = 1 - tanh**2
-        by_slope = np.matmul(out.T, slope) * first[:, :, None]  # (B, h, nz)
-        bias = value @ out * first - 2 * tanh * np.einsum("bhz,hz->bh", by_slope, w)
-        return {
-            "lagrangian.hidden.weight": bias.T @ data.z + by_slope.sum(axis=0),
-            "lagrangian.hidden.bias": bias.sum(axis=0),
-        }
-
     def jacobian(
         self, theta: Float[Array, " P"], data: Assembly
     ) -> tuple[Float[Array, "B n"], Float[Array, "B n P"]]:
@@ -264,18 +215,39 @@ class StructuredNetworks:
         weights, layout = self.unpack(theta), self.spec.layout
         forward = self._forward(weights, data)
         value, gradient = self._output_coefficients(forward, data)  # (B, n, O), (B, n, O, nz)
-        rows, n, count = value.shape
-        output = value[..., None] * forward.basis[:, None, None]  # (B, n, O, H)
+        (rows, n, _), used = value.shape, self._used
+        output = value[..., None] * forward.basis[:, None, None, :used]  # (B, n, O, used)
         for j in range(gradient.shape[3]):
-            output += gradient[..., j, None] * forward.slopes[:, None, None, :, j]
-        parts = [*self._hidden_columns(weights, forward, data, value, gradient)]
-        parts.append(output.reshape(rows, n, count * layout.basis))
+            output += gradient[..., j, None] * forward.slopes[:, None, None, :used, j]
+        parts = (
+            [] if used < layout.basis else [*self._hidden_columns(weights, forward, data, value, gradient)]
+        )
         parts += [
+            output.reshape(rows, n, -1),
             coupling_columns(layout, data.velocity),
             -np.eye(n) * data.push[:, :, None],
             *_dissipation_columns(weights, forward, data),
         ]
-        return forward.residual, np.concatenate(parts, axis=2)[:, :, self._free]
+        return forward.residual, np.concatenate(parts, axis=2)[:, :, self._columns]
+
+    @cached_property
+    def _used(self) -> int:
+        """So many functions of the basis does θ have weights for: not the hidden units where it has none."""
+        layout = self.spec.layout
+        places, shape = self._places["lagrangian.output"]
+        hidden = (
+            self._free[: places.start].any() or self._free[places].reshape(shape)[:, -layout.hidden :].any()
+        )
+        return layout.basis if hidden else layout.basis - layout.hidden
+
+    @cached_property
+    def _columns(self) -> NDArray[np.bool_]:
+        """Which of the columns that `jacobian` makes belong to θ."""
+        if self._used == self.spec.layout.basis:
+            return self._free
+        places, shape = self._places["lagrangian.output"]
+        output = self._free[places].reshape(shape)[:, : self._used]
+        return np.concatenate([output.ravel(), self._free[places.stop :]])
 
     def _output_coefficients(
         self, forward: _Forward, data: Assembly
@@ -339,22 +311,6 @@ def _outputs(
     """Network outputs and their derivatives."""
     out = weights["lagrangian.output"]
     return basis @ out.T, np.matmul(out, slopes)
-
-
-def _pull_friction(
-    weights: dict[str, Array], forward: _Forward, data: Assembly, pull: Float[Array, "B n"]
-) -> dict[str, Array]:
-    """Derivatives by D's friction, width and drag weights, from those by the residual."""
-    a, s = weights["dissipation.friction"], friction_width(weights)
-    force, slope = (
-        np.einsum("bn,bnk->nk", p, x) for p, x in zip((pull, pull * data.velocity), forward.slip, strict=True)
-    )
-    drag = np.einsum("bn,bn->n", pull, data.velocity * np.abs(data.velocity))
-    return {
-        "dissipation.friction": 2 * a * s * force,
-        "dissipation.width": a**2 * (force - slope / s) * (s - NARROWEST),
-        "dissipation.quadratic": 2 * weights["dissipation.quadratic"] * drag,
-    }
 
 
 def _dissipation_columns(weights: dict[str, Array], forward: _Forward, data: Assembly) -> list[Array]:

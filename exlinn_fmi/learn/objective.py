@@ -17,11 +17,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
+from exlinn_fmi.learn.adjoint import Adjoint
 from exlinn_fmi.learn.assembly import Assembly
 from exlinn_fmi.learn.levenberg import Triangle, triangle
 from exlinn_fmi.learn.networks import StructuredNetworks
@@ -29,7 +31,11 @@ from exlinn_fmi.learn.networks import StructuredNetworks
 Array = NDArray[np.float64]
 
 CHUNK = 1024
-"""Samples whose Jacobian is made at once."""
+"""Samples whose Jacobian is made at once, …"""
+ENTRIES = 1_000_000
+"""… fewer where so many entries of each equation's Jacobian do not hold them."""
+SLICE = 512
+"""Samples whose gradient is made at once: they fit into the cache."""
 
 
 class Rows(ABC):
@@ -43,6 +49,10 @@ class Rows(ABC):
     @abstractmethod
     def chunks(self) -> Iterator[Rows]:
         """Parts whose Jacobian is small."""
+
+    @abstractmethod
+    def adjoints(self) -> Iterator[Adjoint]:
+        """Parts whose gradient is made at once."""
 
     @abstractmethod
     def residual(self, theta: Float[Array, " P"]) -> Float[Array, "N n"]:
@@ -81,8 +91,13 @@ class Inverse(Rows):
         return self.data.target
 
     def chunks(self) -> Iterator[Inverse]:
-        """Parts of `CHUNK` samples."""
-        return (Inverse(self.networks, chunk) for chunk in self.data.chunks(CHUNK))
+        """Parts of `CHUNK` samples, or fewer."""
+        size = min(CHUNK, ENTRIES // self.networks.size + 1)
+        return (Inverse(self.networks, chunk) for chunk in self.data.chunks(size))
+
+    def adjoints(self) -> Iterator[Adjoint]:
+        """Parts of `SLICE` samples."""
+        return (Adjoint(self.networks, part) for part in self.data.chunks(SLICE))
 
     def residual(self, theta: Float[Array, " P"]) -> Float[Array, "N n"]:
         """Equations less forces."""
@@ -113,49 +128,80 @@ def loss(rows: Rows, theta: Float[Array, " P"]) -> float:
             r = chunk.residual(theta)
             square += np.sum(r**2, axis=0)
             if not driven.all():
-                x = chunk.inertia(theta)
-                scale += np.where(driven, 0, np.sum(x**2 + (r - x) ** 2, axis=0))
+                scale += _own(r, chunk.inertia(theta), driven)
         return float(np.mean(square / scale))
+
+
+def _own(r: Float[Array, "N n"], x: Float[Array, "N n"], driven: Bool[NDArray[np.bool_], " n"]) -> Array:
+    """‖x‖² + ‖y‖² of the equations that no input acts in, r = x + y; 0 of the others."""
+    return np.asarray(np.where(driven, 0, np.sum(x**2 + (r - x) ** 2, axis=0)))
 
 
 @dataclass(frozen=True)
 class Objective:
-    """The loss + λ‖θ‖² as a function of some of the weights, the others being 0.
+    """The loss + λ‖θ‖².
 
     Args:
         rows: what is to be explained.
         regularisation: λ.
-        chosen: which of the free weights.
     """
 
     rows: Rows
     regularisation: float
-    chosen: Bool[NDArray[np.bool_], " P"]
 
-    def full(self, part: Float[Array, " p"]) -> Float[Array, " P"]:
-        """All free weights."""
-        theta = np.zeros(len(self.chosen))
-        theta[self.chosen] = part
-        return theta
-
-    def value(self, part: Float[Array, " p"]) -> float:
+    def value(self, theta: Float[Array, " P"]) -> float:
         """The objective."""
-        return loss(self.rows, self.full(part)) + self.regularisation * float(part @ part)
+        return loss(self.rows, theta) + self.regularisation * float(theta @ theta)
 
-    def linearise(self, part: Float[Array, " p"]) -> Triangle:
+    @cached_property
+    def _adjoints(self) -> list[Adjoint]:
+        return list(self.rows.adjoints())
+
+    def gradient(self, theta: Float[Array, " P"]) -> tuple[float, Float[Array, " P"]]:
+        """The objective and its gradient, without a Jacobian."""
+        target = np.sum(self.rows.target**2, axis=0)
+        driven, n, squares = target > 0, len(target), np.zeros(len(target))
+        scale, fall = target.copy(), np.zeros(n)
+
+        def upstream(r: Array, x: Array) -> tuple[Array, Array]:
+            """Of Σ r²/(n·scale), where no input acts with scale = Σ x² + (r − x)²."""
+            squares[:] += np.sum(r**2, axis=0)
+            return 2 / n * (r / scale - fall * (r - x)), -2 / n * fall * (2 * x - r)
+
+        with np.errstate(all="ignore"):  # a step too long is refused, whatever it overflows
+            if not driven.all():
+                for one in self._adjoints:
+                    r, x = one.forces(theta)
+                    scale += _own(r, x, driven)
+                    fall += np.sum(r**2, axis=0)
+                fall = np.where(driven, 0, fall / scale**2)
+            gradient = sum(one.gradient(theta, upstream) for one in self._adjoints)
+            value = float(np.mean(squares / scale)) + self.regularisation * float(theta @ theta)
+            return value, np.asarray(gradient + 2 * self.regularisation * theta)
+
+    def sizes(self, theta: Float[Array, " P"]) -> Float[Array, " P"]:
+        """Squares of the norms of the Jacobian's columns, equations weighed as in the objective."""
+        scale = np.sum(self.rows.target**2, axis=0)
+        driven, squares = scale > 0, np.zeros((len(scale), len(theta)))
+        for chunk in self.rows.chunks():
+            r, j = chunk.jacobian(theta)
+            squares += np.einsum("bnp,bnp->np", j, j)
+            if not driven.all():
+                scale += _own(r, chunk.inertia(theta), driven)
+        return np.asarray(np.mean(squares / scale[:, None], axis=0))
+
+    def linearise(self, theta: Float[Array, " P"]) -> Triangle:
         """Of r_i/√scale_i, whose Jacobian is (J − r gᵀ)/√scale with g the relative growth of √scale."""
-        theta, count = self.full(part), len(part)
+        count = len(theta)
         scale = np.sum(self.rows.target**2, axis=0)
         driven, n = scale > 0, len(scale)
         factors, growth = np.zeros((n, count + 1, count + 1)), np.zeros((n, count))
         for chunk in self.rows.chunks():
             r, j = chunk.jacobian(theta)
-            j = j[:, :, self.chosen]
             for i in range(n):
                 factors[i] = triangle(factors[i], np.column_stack([j[:, i], r[:, i]]))
             if not driven.all():
                 x, jx = chunk.inertia_jacobian(theta)
-                jx = jx[:, :, self.chosen]
                 for i in np.flatnonzero(~driven).tolist():
                     rest = r[:, i] - x[:, i]
                     scale[i] += x[:, i] @ x[:, i] + rest @ rest
@@ -163,6 +209,6 @@ class Objective:
         for factor, size, g in zip(factors, scale, growth, strict=True):
             factor[:, :count] -= np.outer(factor[:, count], g / size)
             factor /= np.sqrt(n * size)
-        decay = np.sqrt(self.regularisation) * np.column_stack([np.eye(count), part])
+        decay = np.sqrt(self.regularisation) * np.column_stack([np.eye(count), theta])
         r = triangle(decay, factors.reshape(-1, count + 1))
         return Triangle(float(r[:, count] @ r[:, count]), r[:count, :count], r[:count, count])

@@ -51,7 +51,7 @@ class Candidate(NamedTuple):
     Args:
         name: of the stage.
         theta: weights.
-        chosen: those that are fitted; the others stay 0.
+        chosen: those that are fitted; the others stay as they are.
     """
 
     name: str
@@ -79,7 +79,8 @@ def refine(
     held = replace(_segments(validation), sigma=segments.sigma)
     count, held_count = (s.total * s.measured.shape[2] for s in (segments, held))
     for name, theta, chosen in candidates:
-        part = StructuredNetworks(networks.spec, chosen)
+        part = StructuredNetworks(networks.spec, chosen, theta)
+        used = part.size + np.count_nonzero(theta[~chosen])
         judge = _Judge(part, held)
         now, states, p = segments, None, theta[chosen]
         for most, least in SWEEPS:
@@ -90,7 +91,7 @@ def refine(
             for number, step in enumerate(descent):
                 p, states = shooting.split(step.theta)
                 fitted, judged = Shooting(part, segments).value(step.theta), judge.value(p)
-                score = fitted + judged + part.size * np.log(count + held_count)
+                score = fitted + judged + used * np.log(count + held_count)
                 shares = fitted / count, judged / held_count
                 yield Iterate(part.unpack(p), *shares, name, True, 1, notes, score)
                 if number >= most or value - step.value < least * step.value:

@@ -54,6 +54,8 @@ FRICTION = ("viscous", "friction", "quadratic")
 """Weights of friction, in the order in which it is solved for."""
 SILENT = 1e-9
 """Friction that a solve does without begins with this share of the forces: from 0 it could not grow."""
+COLUMNS = 1000
+"""Of the hidden units as many take part in a linear start as make so many columns."""
 JOIN = 0.02
 """First weight of friction units, relative to the viscous one: small, so that they join without a jolt."""
 
@@ -131,6 +133,7 @@ def hidden_starts(
     """
     layout, part = networks.spec.layout, data.part(slice(None, None, -(-len(data) // SAMPLES)))
     free, basis = layout.free, networks.basis(weights, part)
+    free["lagrangian.output"][:, COLUMNS // len(layout.terms) :] = False
     rows = dict(zip(layout.outputs, free["lagrangian.output"], strict=True))
     masks = [rows[("L", i, 0) if kind == "M" else (kind, i, j)] for kind, i, j in layout.terms]
     kinds = [

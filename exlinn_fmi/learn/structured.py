@@ -3,7 +3,8 @@
 Three stages: the direct path alone, which suffices for mechanisms whose Lagrangian is trigonometric or a low
 polynomial in the positions; then, if the target is not met, with the hidden units, from silent ones or from a
 linear start of their own, whichever is better; both on every k-th sample, since sampled
-motion repeats itself. The last stage takes all samples.
+motion repeats itself. The last stage takes all samples. Networks of many weights take L-BFGS instead of
+Levenberg–Marquardt once the hidden units join.
 
 Where states are noisy, what comes of it is refined on trajectories (`refine`).
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -21,6 +23,7 @@ from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.assembly import data_scales, inverse_assembly
 from exlinn_fmi.learn.iterate import Iterate
+from exlinn_fmi.learn.lbfgs import lbfgs
 from exlinn_fmi.learn.levenberg import levenberg_marquardt
 from exlinn_fmi.learn.networks import StructuredNetworks
 from exlinn_fmi.learn.noise import CLEAN, relative_noise
@@ -30,7 +33,7 @@ from exlinn_fmi.learn.start import Start, hidden_starts, linear_start
 from exlinn_fmi.mechanics.learned import ModelSpec
 from exlinn_fmi.mechanics.structure import UNKNOWN, Structure
 from exlinn_fmi.scenario.learning import Objective as Goal
-from exlinn_fmi.scenario.learning import Structured
+from exlinn_fmi.scenario.learning import Optimiser, Structured
 
 Array = NDArray[np.float64]
 
@@ -40,8 +43,17 @@ CONSISTENT = 1e-3
 """Accelerations that leave no more than this share of the forces unexplained are as good as measured."""
 COARSE = 4000
 """About as many samples do the first stages look at."""
+EQUATIONS = 4
+"""With L-BFGS as many equations at least for each weight, as far as there are."""
+GENERAL = 10.0
+"""A linear start whose loss is so much larger on the validation data is far too rich."""
 PATIENCE = {"direct": (10, 0.5), "hidden": (20, 0.8), "all": (3, 0.5)}
 """A stage ends when that many iterations left more than that share of the loss."""
+PATIENCE_LBFGS = (10, 0.8)
+"""The same for rounds of L-BFGS."""
+LARGE = 1500
+"""More weights than that are left to L-BFGS: there it is ahead for the first minutes, and LM takes 3 s for an
+iteration, which grows with their square as its memory does."""
 
 
 def structured_spec(
@@ -62,6 +74,20 @@ def structured_spec(
     )
     start = linear_start(spec.layout, inverse_assembly(spec, train.arrays), seed)
     return replace(spec, epsilon=start.epsilon), start
+
+
+def optimiser(options: Structured, weights: int) -> tuple[Optimiser, str]:
+    """What makes the loss small once the hidden units join, and why.
+
+    Args:
+        options: the learner's settings.
+        weights: how many there are.
+    """
+    if options.optimiser != "auto":
+        return options.optimiser, f"{options.optimiser}: as the scenario says"
+    if weights > LARGE:
+        return "l-bfgs", f"l-bfgs: {weights} weights, more than {LARGE}"
+    return "levenberg-marquardt", f"levenberg-marquardt: {weights} weights, no more than {LARGE}"
 
 
 def most_iterations(options: Structured, objective: Goal, train: Dataset) -> int:
@@ -100,7 +126,11 @@ def iterate_structured(
         )
     networks = StructuredNetworks(spec)
     best: dict[str, Iterate] = {}
-    notes = {"objective": choose(objective, train)[1], "noise": relative_noise(train)}
+    notes: dict[str, Any] = {
+        "objective": choose(objective, train)[1],
+        "noise": relative_noise(train),
+        "optimiser": optimiser(options, networks.size)[1],
+    }
     stages = _inverse(networks, start, train, validation, options)
     for now, _ in zip(stages, range(options.iterations + 1), strict=False):
         for stage in {now.stage, "any"}:
@@ -110,12 +140,16 @@ def iterate_structured(
     chosen, notes["objective"] = choose(objective, train, best["any"].loss)
     if chosen == "trajectory":
         direct, full = (networks.pack(best[stage].weights) for stage in ("direct", "any"))
-        mask, every = networks.pack_mask(spec.layout.direct), np.ones(networks.size, dtype=bool)
+        mask, large = networks.pack_mask(spec.layout.direct), networks.size > LARGE
+        if large:
+            notes["objective"] += (
+                f"; of {networks.size} weights only the direct path's are fitted to trajectories"
+            )
         if not full[~mask].any():  # units that were never asked begin as they were drawn
             full = np.where(mask, full, networks.pack(start.weights))
         candidates = (
             Candidate("trajectory, direct", direct, mask),
-            Candidate("trajectory", full, every),
+            Candidate("trajectory", full, mask if large else np.ones_like(mask)),
         )
         yield from refine(networks, candidates, train, validation, notes)
 
@@ -146,24 +180,35 @@ def _inverse(
     networks: StructuredNetworks, start: Start, train: Dataset, validation: Dataset, options: Structured
 ) -> Iterator[Iterate]:
     """The three stages on the inverse model."""
-    spec = networks.spec
+    spec, first_order = networks.spec, optimiser(options, networks.size)[0] == "l-bfgs"
     data, held = (Inverse(networks, inverse_assembly(spec, part.arrays)) for part in (train, validation))
-    coarse = Inverse(networks, data.data.part(slice(None, None, -(-len(data.data) // COARSE))))
+    enough = max(COARSE, EQUATIONS * networks.size // len(spec.coordinates) * first_order)
+    coarse = Inverse(networks, data.data.part(slice(None, None, -(-len(data.data) // enough))))
     theta, chosen, met = networks.pack(start.weights), networks.pack_mask(spec.layout.direct), False
     for stage, (patience, share) in PATIENCE.items():
         if stage == "hidden" and met:
             continue
         if stage == "hidden":
             chosen = np.ones_like(chosen)
-            theta = _best_start(theta, coarse, held)
+            best = _best_start(theta, coarse, held)
+            now = Iterate(networks.unpack(best), loss(coarse, best), loss(held, best), stage)
+            if first_order and now.validation_loss > GENERAL * now.loss:
+                yield now  # its weights are so large that L-BFGS would get nowhere from there
+            else:
+                theta = best
         # Units that do not take part yet are silent; each starts from where it was drawn when it joins.
-        objective = Objective(data if stage == "all" else coarse, options.regularisation, chosen)
+        part = StructuredNetworks(spec, chosen)
+        rows, judge = (replace(x, networks=part) for x in (data if stage == "all" else coarse, held))
+        objective = Objective(rows, options.regularisation)
         losses: list[float] = []
-        descent = levenberg_marquardt(theta[chosen], objective.linearise, objective.value, FLOOR)
+        if first_order and chosen.all():
+            patience, share = PATIENCE_LBFGS
+            descent = lbfgs(theta, objective.gradient, objective.sizes)
+        else:
+            descent = levenberg_marquardt(theta[chosen], objective.linearise, objective.value, FLOOR)
         for step in descent:
-            now = objective.full(step.theta)
             losses.append(step.value - options.regularisation * float(step.theta @ step.theta))
-            yield Iterate(networks.unpack(now), losses[-1], loss(held, now), stage)
+            yield Iterate(part.unpack(step.theta), losses[-1], loss(judge, step.theta), stage)
             met = losses[-1] <= options.target
             if met or (len(losses) > patience and losses[-1] > share * losses[-1 - patience]):
                 break

@@ -238,25 +238,29 @@ class Shooting:
         count, r, nx = len(states), len(p), states.shape[1]
         x = self.predict(theta)
         rest, gaps = self.residuals(x), self._gaps(x, states)
-        local = np.zeros((count, nx + r, nx + r))
-        slope = np.zeros((count, nx + r))
+        # Each segment's own part is of its first state; what p alone has is summed up at once.
+        local, slope = np.zeros((count, nx, nx + r)), np.zeros((count, nx))
+        matrix, gradient = np.zeros((theta.size, theta.size)), np.zeros(theta.size)
+
+        def add(where: Int[NDArray[np.intp], " b"] | slice, j: Array, rest: Array) -> None:
+            own, common = j[..., :nx], j[..., nx:].reshape(-1, r)
+            local[where] += own.transpose(0, 2, 1) @ j
+            slope[where] += np.einsum("bxp,bx->bp", own, rest)
+            matrix[:r, :r] += common.T @ common
+            gradient[:r] += rest.ravel() @ common
+
         part: list[Array] = []
         for k, s in enumerate(self._motion.sensitivities(x, data.inputs, p)):
             part.append(s / data.sigma[:, None] * data.counted[:, k, None, None])
             if len(part) == BLOCK or k == len(data.inputs[0]):
-                j = np.concatenate(part, axis=1)
-                r_part = rest[:, k + 1 - len(part) : k + 1].reshape(count, -1)
-                local += j.transpose(0, 2, 1) @ j
-                slope += np.einsum("bxp,bx->bp", j, r_part)
+                rows = rest[:, k + 1 - len(part) : k + 1].reshape(count, -1)
+                add(slice(None), np.concatenate(part, axis=1), rows)
                 part = []
         joined = np.flatnonzero(data.follows >= 0)
         j = s[joined] / (GAP * data.sigma[:, None])
-        local[joined] += j.transpose(0, 2, 1) @ j
-        slope[joined] += np.einsum("bxp,bx->bp", j, gaps[joined])
-        matrix, gradient = np.zeros((theta.size, theta.size)), np.zeros(theta.size)
-        matrix[:r, :r], gradient[:r] = local[:, nx:, nx:].sum(axis=0), slope[:, nx:].sum(axis=0)
-        matrix[r:, :r] = local[:, :nx, nx:].reshape(count * nx, r)
-        matrix[r:, r:], gradient[r:] = block_diag(*local[:, :nx, :nx]), slope[:, :nx].ravel()
+        add(joined, j, gaps[joined])
+        matrix[r:, :r] = local[:, :, nx:].reshape(count * nx, r)
+        matrix[r:, r:], gradient[r:] = block_diag(*local[:, :, :nx]), slope.ravel()
         other = 1 / (GAP * data.sigma)
         for b, jb in zip(joined, j, strict=True):
             this, after = (slice(r + nx * i, r + nx * (i + 1)) for i in (b, data.follows[b]))

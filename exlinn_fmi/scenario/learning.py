@@ -163,12 +163,22 @@ class Measured(Spec):
     )
 
 
+Optimiser = Literal["levenberg-marquardt", "l-bfgs"]
+
+
 class Structured(Spec):
-    """The default learner: M(q) ≻ 0, A(q), V(q), convex D by construction; Levenberg–Marquardt."""
+    """The default learner: M(q) ≻ 0, A(q), V(q), convex D by construction."""
 
     preset: Literal["structured"]
     hidden: int = Field(8, ge=1, le=512, description="units of the hidden layer of each network")
-    iterations: int = Field(300, ge=1, description="most Levenberg–Marquardt iterations")
+    optimiser: Optimiser | Literal["auto"] = Field(
+        "auto",
+        description="`levenberg-marquardt`, which gets furthest; `l-bfgs` for thousands of weights, where "
+        "that takes too much time and memory; `auto`: by the number of weights",
+    )
+    iterations: int = Field(
+        300, ge=1, description="most iterations of Levenberg–Marquardt; rounds of 20 iterations of L-BFGS"
+    )
     target: NonNegative = Field(1e-20, description="stop when the scaled training loss is below this")
     regularisation: NonNegative = Field(1e-24, description="λ of the L2 term")
 
