@@ -34,10 +34,10 @@ def cogging_dataset(seed: int = 1) -> Dataset:
         return (0.05 + 0.01 * ca.cos(3 * q[0])) * v[0] ** 2 - 0.2 * magnets
 
     system = LagrangianSystem.build(DRIVEN, lagrangian, lambda v, p: 0.05 * v[0] ** 2)
-    time = np.arange(1001) * 8e-3
+    time = np.arange(1601) * 5e-3
     frames = [
         simulate(
-            system, multisine(1.0, (0.3, 4), 20, sign * 0.5, seed + k, time)[:, None], 8e-3, trajectory=k
+            system, multisine(1.0, (0.3, 4), 20, sign * 0.5, seed + k, time)[:, None], 5e-3, trajectory=k
         )
         for k, sign in enumerate((1, -1))
     ]
@@ -119,13 +119,13 @@ def peak() -> float:
 
 
 def test_thousands_of_weights_descend_without_a_matrix_of_their_square() -> None:
-    whole, theta = objective(cogging_dataset(), 400, 0.0, off=0.0)
+    whole, theta = objective(cogging_dataset(), 300, 0.0, off=0.0)
     before = whole.value(theta)
     tracemalloc.start()
     steps = [step for step, _ in zip(lbfgs(theta, whole.gradient, whole.sizes), range(6), strict=False)]
     held = peak()
     tracemalloc.stop()
-    assert len(theta) > 2 * LARGE
+    assert len(theta) > 1.5 * LARGE
     assert steps[-1].value < 1e-2 * before
     assert held * 2**20 < 8 * len(theta) ** 2  # Levenberg–Marquardt holds several of this size
 
@@ -133,7 +133,7 @@ def test_thousands_of_weights_descend_without_a_matrix_of_their_square() -> None
 def test_a_large_network_is_trained_to_a_small_validation_loss_in_bounded_memory() -> None:
     parts = split(cogging_dataset(), 0.8, 10, 0)
     tracemalloc.start()
-    model = train(*parts, OPTIONS.model_copy(update={"hidden": 400, "iterations": 8}), 0)
+    model = train(*parts, OPTIONS.model_copy(update={"hidden": 300, "iterations": 6}), 0)
     held = peak()
     tracemalloc.stop()
     assert model.provenance["optimiser"].startswith("l-bfgs")
