@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from exlinn_fmi.control.ocp import BACK_OFF, Ocp
+from exlinn_fmi.control.ocp import Ocp
 from exlinn_fmi.control.pack import pack_networks
 from exlinn_fmi.errors import InputError, RunError
 from exlinn_fmi.toolchain import cached_library
@@ -137,7 +137,7 @@ class Kernel:
             tolerance=tolerance,
             terminal=0.0 if ocp.terminal == "dare" else ocp.terminal,
             set_weight=ocp.set_weight,
-            allowed=BACK_OFF,
+            allowed=ocp.limits.back_off,
         )
         size = self._library.nmpc_size(ctypes.byref(options), ctypes.byref(self._model))
         block = np.zeros(size + 8)

@@ -14,8 +14,8 @@ the same weight on angle and speed the closed loop settles in a second instead o
 name are taken as they are, against the reference states x* that the model needs to follow the reference.
 
 **State bounds** are softened: a violation s of a bound costs l₁ s + l₂ s²/2, l₁ large enough that a bound
-that can be kept is kept exactly. They are moved inwards by half a percent of their range, the room for
-model error.
+that can be kept is kept exactly, at the nodes. They are moved inwards by `back_off`, the room for model error
+and for what happens between two nodes.
 """
 
 from __future__ import annotations
@@ -39,9 +39,6 @@ from exlinn_fmi.scenario.spec import Bounds
 
 HORIZON, KEEN, EASY = 30, 10.0, 1e-3
 """Intervals, weight of the referenced states and of the inputs: the paper's, where nothing else tells."""
-
-BACK_OFF = 0.005
-"""How far state bounds are moved inwards, as a share of their range."""
 
 PENALTY = 1e3
 """l₁ of a state bound over the largest weight times the bound's range."""
@@ -102,6 +99,7 @@ class Limits:
         x_min: their bounds less the back-off, shape (s,).
         x_max: their bounds less the back-off, shape (s,).
         span: size that a violation is related to, shape (s,).
+        back_off: the back-off over `span`.
     """
 
     u_min: NDArray[np.float64]
@@ -111,6 +109,7 @@ class Limits:
     x_min: NDArray[np.float64]
     x_max: NDArray[np.float64]
     span: NDArray[np.float64]
+    back_off: float
 
     @property
     def rated(self) -> bool:
@@ -279,7 +278,7 @@ class Ocp:
 
     def slack(self, x: Float[np.ndarray, "nodes n"]) -> float:
         """Largest violation of a bound as the user gave it (without back-off), over the bound's range."""
-        beyond = self.violations(x) / self.limits.span - BACK_OFF
+        beyond = self.violations(x) / self.limits.span - self.limits.back_off
         return float(max(0.0, beyond.max(initial=0.0)))
 
 
@@ -352,7 +351,8 @@ def _limits(options: Nmpc, system: LagrangianSystem, step: float) -> Limits:
     with np.errstate(invalid="ignore"):
         span = np.where(both, (high - low) / 2, one)
     span[span == 0.0] = 1.0
-    return Limits(u_min, u_max, u_step, soft, low + BACK_OFF * span, high - BACK_OFF * span, span)
+    room = options.back_off * span
+    return Limits(u_min, u_max, u_step, soft, low + room, high - room, span, options.back_off)
 
 
 def _bounds(

@@ -188,6 +188,14 @@ def quantity(path: str, unit: str) -> str:
     return "_".join("".join(c if c.isalnum() else " " for c in words.replace("_", " ")).split())
 
 
+def _ends(bounds: Bounds) -> tuple[float, float, float]:
+    """Lower and upper bound, ∞ where there is none, and their range; the size of one alone."""
+    low = -np.inf if bounds.min is None else bounds.min
+    high = np.inf if bounds.max is None else bounds.max
+    finite = [b for b in (low, high) if np.isfinite(b)]
+    return low, high, high - low if len(finite) == 2 else max(map(abs, finite), default=0.0)
+
+
 def outside(values: NDArray[np.float64], bounds: Bounds) -> NDArray[np.bool_]:
     """Which values are outside their bounds by more than the solver's tolerance; NaN is outside.
 
@@ -195,10 +203,7 @@ def outside(values: NDArray[np.float64], bounds: Bounds) -> NDArray[np.bool_]:
         values: shape (N,).
         bounds: lower and upper bound, of the same unit.
     """
-    low = -np.inf if bounds.min is None else bounds.min
-    high = np.inf if bounds.max is None else bounds.max
-    finite = [b for b in (low, high) if np.isfinite(b)]
-    span = high - low if len(finite) == 2 else max(map(abs, finite), default=0.0)
+    low, high, span = _ends(bounds)
     slack = BOUND_TOLERANCE * span
     beyond: NDArray[np.bool_] = ~((values >= low - slack) & (values <= high + slack))
     return beyond
@@ -235,14 +240,28 @@ def _tracking(frame: pd.DataFrame, loop: Loop, units: Mapping[str, str]) -> dict
 
 
 def _violations(frame: pd.DataFrame, loop: Loop) -> dict[str, float]:
-    """Number of values outside the controller's bounds; left out where one of them was not recorded."""
-    count = 0
+    """Number of values outside the controller's bounds, and the furthest of them over the bounds' range.
+
+    Left out where one of them was not recorded.
+    """
+    count, worst = 0, 0.0
     for path, own, bounds in loop.bounded():
         column = next((c for c in (path, own) if c in frame.columns), None)
         if column is None:
             return {}
-        count += int(np.count_nonzero(outside(frame[column].to_numpy(dtype=float), bounds)))
-    return {"violations": float(count)} if len(frame) else {}
+        values = frame[column].to_numpy(dtype=float)
+        wrong = values[outside(values, bounds)]
+        count += len(wrong)
+        worst = max(worst, _furthest(wrong, bounds))
+    if not len(frame):
+        return {}
+    return {"violations": float(count)} | ({"worst_violation": worst} if count else {})
+
+
+def _furthest(values: NDArray[np.float64], bounds: Bounds) -> float:
+    """How far the furthest value is beyond its bounds, over their range."""
+    low, high, span = _ends(bounds)
+    return float(np.maximum(low - values, values - high).max(initial=0.0)) / (span or 1.0)
 
 
 def _decrease(frame: pd.DataFrame, loop: Loop) -> dict[str, float]:

@@ -40,6 +40,7 @@ WORDING = (
     (r"identify\.(.+)_std", "Standard deviation of {0}", ""),
     (r"identify\.(.+)", "Identified {0}", ""),
     (r"control\.violations", "Recorded values outside their bounds", ""),
+    (r"control\.worst_violation", "Furthest of them beyond its bound, over the bounds' range", ""),
     (r"control\.solve_ms_median", "Time of a solve, median", "ms"),
     (r"control\.solve_ms_p99", "Time of a solve, 99th percentile", "ms"),
     (r"control\.solve_ms_max", "Time of a solve, longest", "ms"),

@@ -161,6 +161,12 @@ class Nmpc(Spec):
     states: dict[str, Bounds] = Field(
         default_factory=dict, description="bounds on states, by name (softened)"
     )
+    back_off: NonNegative = Field(
+        0.005,
+        lt=1,
+        description="how far bounds on states are moved inwards, as a share of half their range: room for "
+        "what the model does not know, and for what states do between two samples",
+    )
     rates: dict[str, Positive] = Field(
         default_factory=dict, description="largest rate of change of inputs, per second, by name"
     )

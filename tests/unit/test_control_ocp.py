@@ -10,7 +10,7 @@ from control_helpers import CART, LIMITS, STEP, arm, constant, generator, motor_
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exlinn_fmi.control.ocp import BACK_OFF, FALLBACK_TERMINAL, Ocp, rk4_sensitivities
+from exlinn_fmi.control.ocp import FALLBACK_TERMINAL, Ocp, rk4_sensitivities
 from exlinn_fmi.control.riccati import solve_dare
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate
@@ -162,14 +162,14 @@ def test_an_input_without_weight_has_a_riccati_solution():
 def test_state_bounds_are_moved_inwards_by_the_back_off():
     lim = ocp(motor_cart(), **LIMITS).limits
     assert lim.soft == [2]
-    assert lim.x_max == [4.0 * (1 - BACK_OFF)]
-    assert lim.x_min == [-4.0 * (1 - BACK_OFF)]
+    assert lim.x_max == [4.0 * (1 - 0.005)]
+    assert lim.x_min == [-4.0 * (1 - 0.005)]
 
 
 def test_a_bound_on_one_side_leaves_the_other_free():
     lim = ocp(motor_cart(), states={"i": Bounds(max=4.0), "alpha": Bounds(min=0.0)}).limits
     np.testing.assert_array_equal(lim.soft, [0, 2])
-    np.testing.assert_array_equal(lim.x_min, [BACK_OFF, -np.inf])
+    np.testing.assert_array_equal(lim.x_min, [0.005, -np.inf])
     assert lim.x_max[0] == np.inf
 
 
@@ -179,7 +179,7 @@ def test_violation_is_penalised_and_reported_over_the_range_of_the_bound():
     assert made.penalty(x) == made.slack(x) == 0.0
     x[7, 2] = -6.0
     assert made.slack(x) == pytest.approx(0.5)
-    s = 2.0 + 4.0 * BACK_OFF
+    s = 2.0 + 4.0 * 0.005
     assert made.penalty(x) == pytest.approx(made.l1[0] * s + made.l2[0] * s**2 / 2)
 
 

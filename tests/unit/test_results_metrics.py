@@ -84,13 +84,17 @@ def test_every_row_outside_a_bound_counts_also_before_settling(frame: pd.DataFra
     beyond = frame.copy()
     beyond.loc[3:7, "plant.v"] = 24.1
     beyond.loc[9, "plant.i"] = -4.01
-    assert control_metrics(beyond, scenario(), UNITS)["control.violations"] == 6
+    metrics = control_metrics(beyond, scenario(), UNITS)
+    assert metrics["control.violations"] == 6
+    assert metrics["control.worst_violation"] == pytest.approx(0.1 / 48)
 
 
 def test_solver_tolerance_is_no_violation(frame: pd.DataFrame) -> None:
     touching = frame.copy()
     touching.loc[3:7, "plant.v"] = 24 + 4e-5
-    assert control_metrics(touching, scenario(), UNITS)["control.violations"] == 0
+    metrics = control_metrics(touching, scenario(), UNITS)
+    assert metrics["control.violations"] == 0
+    assert "control.worst_violation" not in metrics
 
 
 def test_violations_are_left_out_where_a_bounded_state_was_not_recorded(frame: pd.DataFrame) -> None:
