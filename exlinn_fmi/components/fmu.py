@@ -108,6 +108,7 @@ class FmuComponent(Component):
         self._phase = "instantiated"
         self._plans: dict[tuple[str, bytes], _Plan] = {}
         self._h = 0.0
+        self._failed = Status.OK  # or the error after which only a saved state or a fresh instance helps
         self._stepper: Stepper = OwnStep(self._instance)
         self._arrays = start_arrays(self.description)
         self._held: Values = np.full(len(self.variables), np.nan)
@@ -126,11 +127,11 @@ class FmuComponent(Component):
         given = self._without_structure(check_starts(self.name, self.variables, starts))
         if self._phase != "instantiated":
             self._instance.restart()
-        self._phase, self._h, self.message = "instantiated", 0.0, ""
+        self._phase, self._h, self.message, self._failed = "instantiated", 0.0, "", Status.OK
         self._start, self._plans = start_time, {}
         self._arrays = start_arrays(self.description)
         self._stepper = self._make_stepper()
-        status = self._check("set up", self._instance.set_up(start_time, stop_time, self.tolerance))
+        status = self._check("SetupExperiment", self._instance.set_up(start_time, stop_time, self.tolerance))
         if given and status < Status.DISCARD:
             indices = np.array(list(given), dtype=np.intp)
             status = max(status, self.set(indices, np.array(list(given.values()))))
@@ -188,6 +189,8 @@ class FmuComponent(Component):
 
     def set(self, indices: Indices, values: Values) -> Status:
         """Set variables, converted to their types."""
+        if self._failed:
+            return self._failed
         key = ("Set", indices.tobytes())
         plan = self._plans.get(key)
         if plan is None:
@@ -211,6 +214,8 @@ class FmuComponent(Component):
                 variable = self.variables[indices[refused]]
                 self.message = f"{variable.name} is of type {variable.type}: cannot be {values[refused]:g}"
                 return Status.ERROR
+            if worst >= Status.ERROR:
+                break  # nothing more may be asked of it
             code = group.function(*group.arguments)
             if code:
                 worst = max(worst, self._check(f"Set{group.accessor}", code))
@@ -218,6 +223,8 @@ class FmuComponent(Component):
 
     def get(self, indices: Indices, values: Values) -> Status:
         """Read variables."""
+        if self._failed:
+            return self._failed
         key = ("Get", indices.tobytes())
         plan = self._plans.get(key)
         if plan is None:
@@ -226,10 +233,12 @@ class FmuComponent(Component):
         if self._stepper.has_events and self._phase == "stepping":
             worst = self._guarded(self._stepper.settle)
         for group in plan.groups:
+            if worst >= Status.ERROR:
+                break
             code = group.function(*group.arguments)
             if code:
                 worst = max(worst, self._check(f"Get{group.accessor}", code))
-                if code >= Status.DISCARD and group.accessor in TEXTS:
+                if code not in (Status.OK, Status.WARNING) and group.accessor in TEXTS:
                     continue  # what its pointers point to is anybody's guess
             inexact = group.take(values)
             if inexact is not None:
@@ -270,15 +279,18 @@ class FmuComponent(Component):
         if self.description.interface.equal_steps and abs(h - (self._h or h)) > 1e-9 * h:
             self.message = f"takes equal communication steps only: had {self._h:g} s, now {h:g} s"
             return Status.ERROR
+        if self._failed:
+            return self._failed
         self._h = h
         try:
             code = self._stepper.step(t, h)
         except (Refused, Stopped) as problem:
             return self.take_trouble(problem)
+        status = self.take_warnings()
         if self._stepper.remark:
-            self.message, self._stepper.remark = self._stepper.remark, ""
-            return Status.WARNING
-        return Status.OK if code == 0 else self._check("DoStep", code)
+            self.message = "; ".join([self._stepper.remark, *[self.message] * bool(status)])
+            self._stepper.remark, status = "", Status.WARNING
+        return status if code == 0 else max(status, self._check("DoStep", code))
 
     @property
     def takes_input_derivatives(self) -> bool:
@@ -366,8 +378,9 @@ class FmuComponent(Component):
             raise ComponentError(self.name, f"saving the state failed: {self.message}")
         try:
             return _SavedState(self._instance, self._stepper.snapshot(), self._held.copy())
-        except RuntimeError as error:
-            raise ComponentError(self.name, f"saving the state failed: {error}") from error
+        except Refused as problem:
+            self.take_trouble(problem)
+            raise ComponentError(self.name, f"saving the state failed: {self.message}") from problem
 
     def restore_state(self, state: object) -> None:
         """Go back to a state that `save_state` returned in this run.
@@ -378,10 +391,14 @@ class FmuComponent(Component):
         assert isinstance(state, _SavedState)
         if state.generation != self._instance.generation:
             raise ComponentError(self.name, "restoring the state failed: it is of an earlier run")
+        if self._failed == Status.FATAL:
+            raise ComponentError(self.name, f"restoring the state failed: {self.message}")
         try:
             self._instance.set_state(state.pointer)
-        except RuntimeError as error:
-            raise ComponentError(self.name, f"restoring the state failed: {error}") from error
+        except Refused as problem:
+            self.take_trouble(problem)
+            raise ComponentError(self.name, f"restoring the state failed: {self.message}") from problem
+        self._failed = Status.OK
         self._stepper.restore(state.snapshot)
         self._held[:] = state.held
 
@@ -428,7 +445,17 @@ class FmuComponent(Component):
             action()
         except (Refused, Stopped) as problem:
             return self.take_trouble(problem)
-        return Status.OK
+        return self.take_warnings()
+
+    def take_warnings(self) -> Status:
+        """What functions returned a warning since last asked, as a status with a message."""
+        if not self._instance.warned:
+            return Status.OK
+        *others, last = self._instance.warned
+        self._instance.warned.clear()
+        status = self._check(last, Status.WARNING)
+        self.message = "".join(f"{self._instance.prefix}{name}, " for name in others) + self.message
+        return status
 
     def take_trouble(self, problem: Refused | Stopped) -> Status:
         """What went wrong as a status, with a message."""
@@ -448,7 +475,10 @@ class FmuComponent(Component):
         self._instance.remark = ""
         self.message = f"{prefix}{function} returned {word}{f': {said}' if said else ''}"
         # Pending (5) is for asynchronous steps, which we never ask for.
-        return Status(code) if 0 <= code <= Status.FATAL else Status.ERROR
+        status = Status(code) if 0 <= code <= Status.FATAL else Status.ERROR
+        if status >= Status.ERROR:
+            self._failed = status
+        return status
 
 
 @dataclass

@@ -247,6 +247,11 @@ class ModelExchange(Stepper):
             Stopped: it asks to end, or it cannot be integrated.
         """
         at = f"at t = {self.model.t:.9g} s"
+        warned = int(self.model.calls[compiled.WARNED])
+        self.model.calls[compiled.WARNED] = 0
+        for place, name in enumerate(self._instance.model_functions, 1):
+            if warned >> place & 1:
+                self._instance.warned[name] = None
         if code >= compiled.FAILED:
             place, status = divmod(code, compiled.FAILED)
             name = self._instance.model_functions[place - 1]

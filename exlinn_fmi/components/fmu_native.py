@@ -26,7 +26,7 @@ from exlinn_fmi.components.fmu_interfaces import Kind
 from exlinn_fmi.components.native import NativeStep
 from exlinn_fmi.errors import FmuError
 
-DISCARD, ERROR, FATAL = 2, 3, 4
+WARNING, DISCARD, ERROR, FATAL = 1, 2, 3, 4
 
 DTYPES: dict[str, Any] = {
     "Real": np.float64,
@@ -110,6 +110,7 @@ class Instance(ABC):
     def __init__(self, description: FmuDescription, folder: Path, name: str) -> None:
         self.description, self.name, self.folder = description, name, folder
         self.remark = ""
+        self.warned: dict[str, None] = {}  # functions that returned a warning nobody was told of yet
         self.roll_back = False
         self.usable = True
         self.stepping = False
@@ -169,10 +170,13 @@ class Instance(ABC):
         wanted = [c for c in self.description.log_categories if c.startswith("logStatus")]
         if wanted:
             names = (ctypes.c_char_p * len(wanted))(*(c.encode() for c in wanted))
-            # What it returns does not matter: an FMU that cannot choose runs all the same.
-            self.function("SetDebugLogging", c_void_p, c_bool, c_size_t, c_void_p)(
-                self.pointer, True, len(wanted), names
-            )
+            choose = self.function("SetDebugLogging", c_void_p, c_bool, c_size_t, c_void_p)
+            # An FMU that cannot choose runs all the same.
+            if self.code(choose(self.pointer, True, len(wanted), names)) == FATAL:
+                raise FmuError(
+                    f"{self.description.path}: {self.prefix}SetDebugLogging returned {self.prefix}Fatal"
+                    f"{self.said(': ')}"
+                )
 
     def restart(self) -> None:
         """Back to the state after instantiation, by a fresh instance where the FMU allows more than one."""
@@ -186,7 +190,8 @@ class Instance(ABC):
         if self.pointer and self.usable:
             if self.stepping:
                 self.call(self.terminate)
-            self.function(self.release, c_void_p, result=None)(self.pointer)
+            if self.usable:
+                self.function(self.release, c_void_p, result=None)(self.pointer)
         self.pointer, self.stepping = None, False
 
     def close(self) -> None:
@@ -226,9 +231,9 @@ class Instance(ABC):
 
     def code(self, code: int) -> int:
         """A status code, heeded: fmi2Fatal kills the instance, after fmi2Error it can only be freed."""
-        if code >= ERROR:
+        if code >= ERROR or code < 0:
             self.stepping = False
-            self.usable = code != FATAL
+            self.usable &= code != FATAL
         return code
 
     def demand(self, name: str, *arguments: Any) -> None:
@@ -238,8 +243,17 @@ class Instance(ABC):
             Refused: it returned fmi…Discard or worse.
         """
         kinds = [type(argument) for argument in arguments]
-        code = self.code(self.function(name, c_void_p, *kinds)(self.pointer, *arguments))
-        if code >= DISCARD:
+        self.heed(name, self.function(name, c_void_p, *kinds)(self.pointer, *arguments))
+
+    def heed(self, name: str, code: int) -> None:
+        """Note a warning that a function returned.
+
+        Raises:
+            Refused: it returned anything else than that or fmi…OK.
+        """
+        if code == WARNING:
+            self.warned[name] = None
+        elif self.code(code) != 0:
             raise Refused(name, code)
 
     @abstractmethod
@@ -323,12 +337,10 @@ class Instance(ABC):
         """A saved state, to be freed by `free_state`; from now on steps know that they may be undone.
 
         Raises:
-            RuntimeError: the FMU reports an error.
+            Refused: the FMU reports an error.
         """
         state = c_void_p()
-        function = self.function(f"Get{self.state_noun}", c_void_p, c_void_p)
-        if self.code(function(self.pointer, byref(state))) >= DISCARD:
-            raise RuntimeError(self.said())
+        self.demand(f"Get{self.state_noun}", pointer_to(state))
         self.roll_back = True
         return state.value or 0
 
@@ -336,17 +348,16 @@ class Instance(ABC):
         """Go back to a saved state.
 
         Raises:
-            RuntimeError: the FMU reports an error.
+            Refused: the FMU reports an error.
         """
-        function = self.function(f"Set{self.state_noun}", c_void_p, c_void_p)
-        if self.code(function(self.pointer, state)) >= DISCARD:
-            raise RuntimeError(self.said())
+        self.demand(f"Set{self.state_noun}", c_void_p(state))
+        self.stepping = True  # also after an error, which is behind it now
 
     def free_state(self, state: int) -> None:
         """Free a saved state."""
         if self.pointer and self.usable:
             held = c_void_p(state)
-            self.function(f"Free{self.state_noun}", c_void_p, c_void_p)(self.pointer, byref(held))
+            self.code(self.function(f"Free{self.state_noun}", c_void_p, c_void_p)(self.pointer, byref(held)))
 
     def serialize(self, state: int) -> bytes:
         """A saved state as bytes.

@@ -26,9 +26,10 @@ FAILED = 100
 """What `integrate` returns: a reason, or FAILED · (place of the function in `calls`) + its status."""
 
 INSTANCE, SET_TIME, SET_STATES, GET_DERIVATIVES, GET_INDICATORS, COMPLETED = range(6)
-SET_INPUTS, GET_OUTPUTS, VERSION, KEEP, INPUTS, OUTPUTS, FLAGS = range(6, 13)
+SET_INPUTS, GET_OUTPUTS, VERSION, KEEP, INPUTS, OUTPUTS, FLAGS, WARNED = range(6, 14)
 """Places in `calls`: the instance, addresses of functions, FMI version, whether states are saved, addresses
-of the value references of inputs that vary and of outputs that are sampled, and room for two flags."""
+of the value references of inputs that vary and of outputs that are sampled, room for two flags, and a bit for
+each function that has returned a warning, by its place."""
 
 T, H, STEPS, REJECTED, STIFFNESS, T_INPUT, RTOL = range(7)
 """Places in `clock`: time, next step, counters, steps that looked stiff, time of inputs, tolerance."""
@@ -53,7 +54,7 @@ class Model:
     """An FMU as the compiled functions see it, and the room they work in; numba likes few and plain arrays.
 
     Args:
-        calls: (13,) see `INSTANCE` and on.
+        calls: (14,) see `INSTANCE` and on.
         clock: (7,) see `T` and on.
         w: [state units] (16, n) see `X` and on.
         z: (3, m) event indicators, see `HERE` and on.
@@ -75,7 +76,7 @@ class Model:
         """A model at time 0 of `calls` (10,), without inputs and outputs."""
         none = np.zeros(0, dtype=np.uint32)
         model = Model(
-            np.array([*calls, 0, 0, 0], dtype=np.int64),
+            np.array([*calls, 0, 0, 0, 0], dtype=np.int64),
             np.zeros(7),
             np.zeros((16, states)),
             np.zeros((3, indicators)),
@@ -128,17 +129,23 @@ def invoke(_: Any, address: Any, arguments: Any) -> Any:  # pragma: no cover - r
 
 
 @njit(cache=True)
+def judged(calls: Any, place: int, status: int) -> Any:
+    """A status of a function as 0 or a code; a warning is noted."""
+    if status == 1:
+        calls[WARNED] |= 1 << place
+    if status in (0, 1):
+        return 0
+    return FAILED * place + (status if 0 < status < FAILED else FAILED - 1)
+
+
+@njit(cache=True)
 def apply(calls: Any, clock: Any, w: Any, u: Any, t: float, row: int) -> Any:
     """Give the FMU a time, the states in a row, and inputs where they vary; 0 or a code."""
     instance, n, k = calls[INSTANCE], w.shape[1], u.shape[1]
-    status = invoke(calls[SET_TIME], (instance, t))
-    if status > 1:
-        return FAILED * SET_TIME + status
-    if n:
-        status = invoke(calls[SET_STATES], (instance, w[row].ctypes.data, n))
-        if status > 1:
-            return FAILED * SET_STATES + status
-    if k:
+    code = judged(calls, SET_TIME, invoke(calls[SET_TIME], (instance, t)))
+    if code == 0 and n:
+        code = judged(calls, SET_STATES, invoke(calls[SET_STATES], (instance, w[row].ctypes.data, n)))
+    if code == 0 and k:
         for j in range(k):
             u[NOW, j] = u[VALUE, j] + (t - clock[T_INPUT]) * u[RATE, j]
         values = u[NOW].ctypes.data
@@ -146,9 +153,8 @@ def apply(calls: Any, clock: Any, w: Any, u: Any, t: float, row: int) -> Any:
             status = invoke(calls[SET_INPUTS], (instance, calls[INPUTS], k, values))
         else:
             status = invoke(calls[SET_INPUTS], (instance, calls[INPUTS], k, values, k))
-        if status > 1:
-            return FAILED * SET_INPUTS + status
-    return 0
+        code = judged(calls, SET_INPUTS, status)
+    return code
 
 
 @njit(cache=True)
@@ -157,8 +163,7 @@ def derivatives(calls: Any, clock: Any, w: Any, u: Any, t: float, row: int, into
     code, n = apply(calls, clock, w, u, t, row), w.shape[1]
     if code == 0 and n:
         status = invoke(calls[GET_DERIVATIVES], (calls[INSTANCE], w[into].ctypes.data, n))
-        if status > 1:
-            return FAILED * GET_DERIVATIVES + status
+        code = judged(calls, GET_DERIVATIVES, status)
     return code
 
 
@@ -168,8 +173,7 @@ def indicators(calls: Any, clock: Any, w: Any, z: Any, u: Any, t: float, row: in
     code, m = apply(calls, clock, w, u, t, row), z.shape[1]
     if code == 0 and m:
         status = invoke(calls[GET_INDICATORS], (calls[INSTANCE], z[into].ctypes.data, m))
-        if status > 1:
-            return FAILED * GET_INDICATORS + status
+        code = judged(calls, GET_INDICATORS, status)
     return code
 
 
@@ -191,9 +195,9 @@ def arrive(calls: Any, clock: Any, w: Any, z: Any, u: Any) -> Any:
     calls[FLAGS] = 0
     at = calls.ctypes.data + 8 * FLAGS
     undone = np.int32(calls[KEEP] == 0)
-    status = invoke(calls[COMPLETED], (calls[INSTANCE], undone, at, at + 4))
-    if status > 1:
-        return FAILED * COMPLETED + status
+    code = judged(calls, COMPLETED, invoke(calls[COMPLETED], (calls[INSTANCE], undone, at, at + 4)))
+    if code:
+        return code
     if calls[FLAGS] >> 32:
         return TERMINATE
     return STEP_EVENT if calls[FLAGS] else REACHED
@@ -349,8 +353,9 @@ def sample(
             status = invoke(calls[GET_OUTPUTS], (calls[INSTANCE], calls[OUTPUTS], p, at))
         else:
             status = invoke(calls[GET_OUTPUTS], (calls[INSTANCE], calls[OUTPUTS], p, at, p))
-        if status > 1:
-            return row, FAILED * GET_OUTPUTS + status
+        code = judged(calls, GET_OUTPUTS, status)
+        if code:
+            return row, code
         row += 1
     return row, 0
 

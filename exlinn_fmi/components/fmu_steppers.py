@@ -11,7 +11,7 @@ import numpy as np
 
 from exlinn_fmi.components.base import Values
 from exlinn_fmi.components.fmu_events import EventMode, Stopped, close
-from exlinn_fmi.components.fmu_native import DISCARD, Instance
+from exlinn_fmi.components.fmu_native import DISCARD, WARNING, Instance
 from exlinn_fmi.components.fmu_versions import Instance3
 
 
@@ -125,14 +125,15 @@ class EventedStep(Stepper):
     def step(self, t: float, h: float) -> int:
         """fmi3DoStep from event to event."""
         self.settle()
-        end, stuck = t + h, 0
+        end, stuck, worst = t + h, 0, 0
         self._t = t
         while not close(self._t, end):
             target = min(end, self._events.next_event)
             if target > self._t:
                 code, reached, event = self._instance.step_to_event(self._t, target - self._t)
-                if code >= DISCARD:
+                if code not in (0, WARNING):
                     return code
+                worst = max(worst, code)
                 stuck = 0 if reached > self._t else stuck + 1
                 if stuck > 10:
                     raise Stopped(f"fmi3DoStep does not get beyond t = {self._t:.9g} s", DISCARD)
@@ -142,7 +143,7 @@ class EventedStep(Stepper):
             if event or self._events.next_event <= self._t or close(self._events.next_event, self._t):
                 self._events.handle(self._t)
         self._t = end
-        return 0
+        return worst
 
     def snapshot(self) -> Values:
         """Time and time events."""

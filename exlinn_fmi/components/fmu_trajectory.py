@@ -7,6 +7,7 @@ the solver's steps are as long as the tolerance allows, however dense the rows.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -42,6 +43,9 @@ def trajectory(
     Raises:
         InputError: it is not open for Model Exchange, or a name, a start value or a shape does not fit.
         ComponentError: the FMU reports an error or cannot be integrated.
+
+    Warns:
+        UserWarning: a function of the FMU returned a warning.
     """
     from exlinn_fmi.components.fmu_exchange import ModelExchange
 
@@ -70,6 +74,8 @@ def trajectory(
     except (Refused, Stopped) as problem:
         component.take_trouble(problem)
         raise ComponentError(component.name, component.message, time=stepper.model.t) from problem
+    if component.take_warnings() or status:
+        warnings.warn(f"{component.name}: {component.message}", UserWarning, stacklevel=2)
     return np.vstack([begun, rest])
 
 

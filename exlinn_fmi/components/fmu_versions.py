@@ -182,9 +182,8 @@ class Instance2(Instance):
         """What fmi2DoStep returned, with a remark where it says more."""
         if code == DISCARD:
             ended = c_int()
-            self.function("GetBooleanStatus", c_void_p, c_int, c_void_p)(
-                self.pointer, fmi2.fmi2Terminated, byref(ended)
-            )
+            status = self.function("GetBooleanStatus", c_void_p, c_int, c_void_p)
+            self.code(status(self.pointer, fmi2.fmi2Terminated, byref(ended)))
             self.remark = "the FMU asks to end the simulation" if ended.value else ""
         return code
 
@@ -261,8 +260,7 @@ class Instance3(Instance):
                 )
                 values[0] = value
                 function, arguments = self.accessor("Set", accessor, references, values)
-                if (code := self.code(function(*arguments))) >= DISCARD:
-                    raise Refused(f"Set{accessor}", code)
+                self.heed(f"Set{accessor}", function(*arguments))
             self.demand("ExitConfigurationMode")
         except Refused as refused:
             raise FmuError(

@@ -132,10 +132,12 @@ class Compiled(Stepper):
         state[k.UNTIL] = tick
         self._aim(last + 1)
         reason, at = k.STATUS, line
-        while reason == k.STATUS and worst < Status.DISCARD:
+        while reason == k.STATUS:
             native = acts[at].native
             assert native is not None
             worst = max(worst, native.heed(acts[at].name, int(state[k.RESULT])))
+            if worst >= Status.ERROR:
+                break  # nothing more may be asked of it
             at, reason = divmod(self._loop(self._where), k.REASONS)
         if reason == k.REFUSED:
             self._see_to(reason, at)

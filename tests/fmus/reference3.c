@@ -241,5 +241,8 @@ EXPORT fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 t, fmi3Float64 h, fmi3B
         if (f->early) break;
     }
     *reached = f->v.r[0];
+#ifdef FAULT_STEP
+    if (f->v.r[0] > 0.5) return FAULT_STEP;
+#endif
     return fmi3OK;
 }

@@ -438,7 +438,7 @@ def test_a_state_of_an_earlier_run_is_not_freed_in_a_later_one(tmp_path: Path, t
 
 def test_a_state_that_cannot_be_saved_is_a_component_error(tmp_path: Path) -> None:
     driver = faulty(tmp_path, "REFUSE_STATE")
-    with pytest.raises(ComponentError, match=r"probe: saving the state failed: GetFMUstate is not allowed"):
+    with pytest.raises(ComponentError, match=r"probe: saving the state failed: .*GetFMUstate is not allowed"):
         driver.component.save_state()
 
 
