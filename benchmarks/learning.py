@@ -22,7 +22,7 @@ import math
 import multiprocessing
 import resource
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from statistics import median
@@ -70,11 +70,11 @@ TRUTH = {p.name: p.value for p in PLANT.parameters}
 FIGURES: dict[str, Figure] = {}
 
 
-def figure(name: str, must: float, stretch: float = math.nan, at_least: bool = False, slow: bool = False):
+def figure(name: str, must: float, stretch: float = math.nan, **kind: bool):
     """Put a function into `FIGURES`: from the bench to the number."""
 
     def put(measure: Callable[[Bench], float]) -> Callable[[Bench], float]:
-        FIGURES[name] = Figure(measure, must, stretch, at_least, slow)
+        FIGURES[name] = Figure(measure, must, stretch, **kind)
         return measure
 
     return put
@@ -86,7 +86,7 @@ def force_mse(bench: Bench) -> float:
     return median(_force_mse(bench, bench.ours("structured", seed)[0].system) for seed in bench.seeds)
 
 
-@figure("clean.net_force_mse", 1e-10, 1e-12)
+@figure("clean.net_force_mse", 1e-10, 1e-12, whole=False)
 def net_force_mse(bench: Bench) -> float:
     """The same with the paper's four neurons, smooth, and nothing beside them."""
     from baselines.bare_network import bare_network
@@ -131,7 +131,7 @@ def param_error(bench: Bench) -> float:
     return float(found["rel_error"].max(skipna=False))
 
 
-@figure("baseline_over_ours", 1000, at_least=True)
+@figure("baseline_over_ours", 1000, at_least=True, whole=False)
 def baseline_over_ours(bench: Bench) -> float:
     """10 s free run of the best peer over ours."""
     best = min(bench.peer_row(slug).numbers["rollout_nrmse_10s"] for slug in peers())
@@ -236,21 +236,27 @@ def _train_on_file(path: Path) -> tuple[float, float]:
 # ── the command ──────────────────────────────────────────────────────────────────────────────────────────
 
 
-def measure(bench: Bench, only: Sequence[str], console: Console) -> tuple[dict[str, float], list[Row]]:
-    """The figures and the rows of the table that are asked for."""
+def measure(
+    bench: Bench, only: Sequence[str], console: Console
+) -> Iterator[tuple[dict[str, float], list[Row]]]:
+    """The figures and the rows of the table that are asked for, after each what there is so far."""
 
     def wanted(name: str) -> bool:
         return not only or any(name.startswith(start) for start in only)
 
-    found = {}
+    found, rows = {}, []
     for name, entry in FIGURES.items():
         if wanted(name) and not (bench.quick and entry.slow):
             began = time.perf_counter()
             found[name] = entry.measure(bench)
             console.log(f"{name} = {found[name]:.3g} after {time.perf_counter() - began:.0f} s")
-    rows = [bench.our_row(preset, 0) for preset in ("structured", "terms") if wanted(f"ours.{preset}")]
-    rows += [bench.peer_row(slug) for slug in peers() if wanted(f"peers.{slug}")]
-    return found, rows
+            yield found, rows
+    table = {f"ours.{preset}": partial(bench.our_row, preset, 0) for preset in ("structured", "terms")}
+    table |= {f"peers.{slug}": partial(bench.peer_row, slug) for slug in peers()}
+    for name, row in table.items():
+        if wanted(name):
+            rows.append(row())
+            yield found, rows
 
 
 def main() -> None:
@@ -265,20 +271,31 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="beginnings of names")
     options = parser.parse_args()
     console = Console(stderr=True)
-    with threadpool_limits(1):
-        found, rows = measure(Bench(options.seeds, options.quick), options.only, console)
-    numbers = dict(found)
-    for row in rows:
-        numbers |= {f"{row.key}.{name}": value for name, value in row.numbers.items()}
+    found, rows, stopped = {}, [], False
+    try:
+        with threadpool_limits(1):
+            for found, rows in measure(Bench(options.seeds, options.quick), options.only, console):
+                keep(found, rows, [options.out / "learning.json", options.json])
+    except KeyboardInterrupt:
+        stopped = True
+        console.log("interrupted: what was measured until then is kept")
     paper = Console(width=max(Console().width, 110))
     if found:
-        print_figures(found, FIGURES, paper)
+        print_figures(found, FIGURES, paper, options.quick)
     if rows:
         print_table(rows, paper)
         draw(rows, options.out)
-    write_json(options.out / "learning.json", numbers)
-    if options.json:
-        write_json(options.json, numbers)
+    raise SystemExit(130 if stopped else 0)
+
+
+def keep(found: dict[str, float], rows: list[Row], files: Sequence[Path | None]) -> None:
+    """Write all numbers that there are."""
+    numbers = dict(found)
+    for row in rows:
+        numbers |= {f"{row.key}.{name}": value for name, value in row.numbers.items()}
+    for file in files:
+        if file:
+            write_json(file, numbers)
 
 
 if __name__ == "__main__":

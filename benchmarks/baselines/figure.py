@@ -22,6 +22,7 @@ class Figure(NamedTuple):
         at_least: whether it is to be large.
         slow: whether it takes long.
         most: what it must not exceed even where it is to be large.
+        whole: whether a quick run measures it as well as a long one; else nothing follows from it.
     """
 
     measure: Callable[[Any], float]
@@ -30,6 +31,7 @@ class Figure(NamedTuple):
     at_least: bool = False
     slow: bool = False
     most: float = math.inf
+    whole: bool = True
 
     def met(self, value: float) -> str:
         """In a word."""
@@ -53,11 +55,14 @@ class Figure(NamedTuple):
         return ("≥ " if self.at_least else "≤ ") + text(self.must)
 
 
-def print_figures(found: Mapping[str, float], figures: Mapping[str, Figure], console: Console) -> None:
-    """Each number beside what it must be."""
+def print_figures(
+    found: Mapping[str, float], figures: Mapping[str, Figure], console: Console, quick: bool = False
+) -> None:
+    """Each number beside what it must be, and whether it is, unless a quick run cannot tell."""
     table = Table("figure", "measured", "must", "stretch", "")
     for name, value in found.items():
         wanted = figures[name]
         stretch = "" if math.isnan(wanted.stretch) else text(wanted.stretch)
-        table.add_row(name, f"{value:.3g}", wanted.bounds, stretch, wanted.met(value))
+        word = "not by a quick run" if quick and not wanted.whole else wanted.met(value)
+        table.add_row(name, f"{value:.3g}", wanted.bounds, stretch, word)
     console.print(table)
