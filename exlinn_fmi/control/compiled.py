@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import resources
 from typing import Any
 
@@ -115,12 +115,12 @@ class Kernel:
             raise InputError(
                 f"the compiled solver has room for {MOST_STATES} states and {MOST_INPUTS} inputs"
             )
-        self._library = _load(kernel_sources(), "nmpc.c", "-fvisibility=hidden", f"-DNMPC_API={EXPORT}")
+        self._library = load(kernel_sources(), "nmpc.c", "-fvisibility=hidden", f"-DNMPC_API={EXPORT}")
         self._library.nmpc_size.restype = ctypes.c_size_t
         self._library.nmpc_array.restype = ctypes.c_void_p
         self.packed = pack_networks(ocp.system)
         """The model's networks as integers and numbers, None where it is a generated function."""
-        self._model, self._keep = _model(ocp, self.packed)
+        self._model, self._keep = make_model(self.packed, lambda: ocp.sensitivities)
         options = Head(
             states=ocp.n,
             inputs=ocp.m,
@@ -215,8 +215,18 @@ class Kernel:
         self._library.nmpc_program(*self._call)
 
 
-def _load(sources: Mapping[str, bytes], main: str, *more: str) -> ctypes.CDLL:
-    """A library for this processor, or where the compiler does not know how to ask for that, for any."""
+def load(sources: Mapping[str, bytes], main: str, *more: str) -> ctypes.CDLL:
+    """A library for this processor, or where the compiler does not know how to ask for that, for any.
+
+    Args:
+        sources: file names and contents.
+        main: the one that is compiled.
+        more: flags besides those of all libraries.
+
+    Raises:
+        InputError: there is no C compiler.
+        RunError: the compiler failed.
+    """
     try:
         file = cached_library(sources, main, (*FLAGS, "-march=native", *more))
     except RunError:
@@ -224,19 +234,28 @@ def _load(sources: Mapping[str, bytes], main: str, *more: str) -> ctypes.CDLL:
     return ctypes.CDLL(str(file))
 
 
-def _model(
-    ocp: Ocp, packed: tuple[NDArray[np.int64], NDArray[np.float64]] | None
+def make_model(
+    packed: tuple[NDArray[np.int64], NDArray[np.float64]] | None, interval: Callable[[], ca.Function]
 ) -> tuple[_Model, list[object]]:
-    """The model as the kernel takes it, and what has to live as long."""
+    """The model as compiled code takes it, and what has to live as long.
+
+    Args:
+        packed: its networks, if it is made of some.
+        interval: else the function that says where an interval ends, with its derivatives.
+
+    Raises:
+        InputError: there is no C compiler, or the function is too long for it.
+        RunError: the compiler failed.
+    """
     if packed is not None:
         integers, numbers = packed
         return _Model(integers=integers.ctypes.data, numbers=numbers.ctypes.data), [integers, numbers]
-    function = ocp.sensitivities
+    function = interval()
     if function.n_instructions() > MOST_INSTRUCTIONS:
         raise InputError(f"the model is too long to be compiled ({function.n_instructions()} instructions)")
     generator = ca.CodeGenerator("model.c", {"with_header": False, "casadi_int": "long long int"})
     generator.add(function)
-    library = _load({"model.c": generator.dump().encode()}, "model.c")
+    library = load({"model.c": generator.dump().encode()}, "model.c")
     entry = ctypes.cast(getattr(library, function.name()), ctypes.c_void_p).value
     made = _Model(
         function=entry,

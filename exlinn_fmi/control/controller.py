@@ -28,7 +28,7 @@ from exlinn_fmi.components.packing import pack, unpack
 from exlinn_fmi.control.defaults import completed, estimator, measure, refined
 from exlinn_fmi.control.diagnosis import diagnose
 from exlinn_fmi.control.dropout import Heard, Listener
-from exlinn_fmi.control.estimator import Belief, Estimator, Sample
+from exlinn_fmi.control.estimator import Belief, Estimator, Window
 from exlinn_fmi.control.memory import Memory
 from exlinn_fmi.control.ocp import HORIZON, Ocp, check_names
 from exlinn_fmi.control.reference import ReferenceGenerator, References
@@ -236,7 +236,7 @@ class NmpcController(Component):
 
     def deserialize_state(self, data: bytes) -> object:
         """A state from bytes."""
-        return unpack(data, (Memory, Plan, References, Belief, Sample, Heard))
+        return unpack(data, (Memory, Plan, References, Belief, Window, Heard))
 
     def close(self) -> None:
         """Nothing to free."""

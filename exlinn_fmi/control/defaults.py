@@ -19,7 +19,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from exlinn_fmi.control.batch import Batch
-from exlinn_fmi.control.estimator import Direct, Estimator, ExtendedKalman, MovingHorizon, Noise
+from exlinn_fmi.control.estimator import Direct, Estimator, ExtendedKalman, Noise
+from exlinn_fmi.control.moving_horizon import MovingHorizon
 from exlinn_fmi.control.ocp import check_names, rk4_sensitivities
 from exlinn_fmi.control.reference import ReferenceGenerator, References
 from exlinn_fmi.errors import ModelError
@@ -195,7 +196,9 @@ def estimator(
         raise ModelError(f"estimator: no state is measured; connect some of {', '.join(names)}")
     noise = _noise(spec, system, measured, sizes, first, spec.disturbances)
     if kind == "mhe":
-        return MovingHorizon(system, noise, step, options.substeps or 1, spec.window, spec.iterations)
+        return MovingHorizon(
+            system, noise, step, options.substeps or 1, spec.window, spec.iterations, options.backend
+        )
     steady = (first.x[0], first.u[0]) if spec.gain == "steady" else None
     return ExtendedKalman(system, noise, step, options.substeps or 1, steady)
 

@@ -7,8 +7,7 @@ and references and plan are made under it: what is measured then follows its ref
 
 - `none`: states are as measured; where one is not a number, the model's prediction stands in.
 - `ekf`: extended Kalman filter, with the gain updated at each sample or that of the steady state.
-- `mhe`: moving horizon estimation over a window, by Gauss–Newton: the iterated Kalman smoother (B. Bell,
-  The iterated Kalman smoother as a Gauss–Newton method, SIAM J. Optim. 4, 1994), arrival cost by the filter.
+- `mhe`: moving horizon estimation over a window, see moving_horizon.py.
 
 A measurement that is not a number counts as not made.
 """
@@ -27,6 +26,9 @@ from exlinn_fmi.control.batch import Batch
 from exlinn_fmi.control.riccati import solve_dare
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.learned import TURN
+
+QUIET = np.errstate(over="ignore", invalid="ignore")
+"""What leaves the finite is told by the belief (`Belief.finite`), not by warnings."""
 
 
 @dataclass(frozen=True)
@@ -53,18 +55,20 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Sample:
-    """What a window remembers of one sampling time.
+class Window:
+    """What is remembered of the last samples, oldest first.
 
     Args:
-        mean: z that was believed, where the next linearisation is made, shape (n + d,).
-        y: measurements, shape (n,); NaN where none was made.
-        u: input that was held from then on, shape (m,).
+        points: z that was believed, where the next linearisation is made, shape (k, n + d).
+        y: measurements, shape (k, n); NaN where none was made.
+        u: inputs that were held from then on, shape (k, m).
+        arrival: mean (n + d,) and covariance (n + d, n + d) at the oldest, before its measurement.
     """
 
-    mean: NDArray[np.float64]
+    points: NDArray[np.float64]
     y: NDArray[np.float64]
     u: NDArray[np.float64]
+    arrival: tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -75,15 +79,13 @@ class Belief:
         mean: shape (n + d,).
         covariance: shape (n + d, n + d).
         y: measurements at that time, shape (n,), NaN where none was made.
-        window: the samples before, oldest first (moving horizon).
-        arrival: mean and covariance at the oldest of them before its measurement (moving horizon).
+        window: the samples before (moving horizon).
     """
 
     mean: NDArray[np.float64]
     covariance: NDArray[np.float64]
     y: NDArray[np.float64]
-    window: tuple[Sample, ...] = ()
-    arrival: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+    window: Window | None = None
 
     @property
     def finite(self) -> bool:
@@ -145,32 +147,47 @@ class Estimator(ABC):
 
     # ── what filters are made of ─────────────────────────────────────────────────────────────────────────
 
+    @QUIET
     def innovation(
         self, mean: Float[np.ndarray, " z"], y: Float[np.ndarray, " n"]
     ) -> tuple[Int[np.ndarray, " s"], Float[np.ndarray, " s"]]:
         """Which states were measured, and measured less expected; angles by the shorter way round."""
         seen = np.flatnonzero(np.isfinite(y) & self.noise.measured)
         difference, turn = y[seen] - mean[seen], self.turn[seen]
-        with np.errstate(invalid="ignore"):
-            turns = np.where(np.isfinite(turn), np.rint(difference / turn) * turn, 0.0)
+        turns = np.where(np.isfinite(turn), np.rint(difference / turn) * turn, 0.0)
         return seen, difference - np.nan_to_num(turns)
 
+    @QUIET
     def corrected(
         self, mean: Float[np.ndarray, " z"], P: Float[np.ndarray, "z z"], y: Float[np.ndarray, " n"]
     ) -> tuple[Float[np.ndarray, " z"], Float[np.ndarray, "z z"]]:
         """Mean and covariance after a measurement, in Joseph's form, which keeps the covariance positive."""
-        seen, difference = self.innovation(mean, y)
-        if not len(seen):
-            return mean, P
-        R = np.diag(self.noise.measurement[seen] ** 2)
         try:
-            K = np.linalg.solve(P[np.ix_(seen, seen)] + R, P[seen]).T
+            return self.correction(mean, P, y)[:2]
         except np.linalg.LinAlgError:  # P has grown until R is lost in rounding: nothing is known any more
             return np.full_like(mean, np.nan), P
+
+    def correction(
+        self, mean: Float[np.ndarray, " z"], P: Float[np.ndarray, "z z"], y: Float[np.ndarray, " n"]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.intp], NDArray[np.float64]]:
+        """The same, which states were measured (s,), and the innovation over its covariance beside the gain.
+
+        The last is shape (s, 1 + z): S⁻¹ (y − ŷ), S⁻¹ C P.
+
+        Raises:
+            LinAlgError: that covariance is singular.
+        """
+        seen, difference = self.innovation(mean, y)
+        R = np.diag(self.noise.measurement[seen] ** 2)
+        weighed = np.linalg.solve(P[np.ix_(seen, seen)] + R, np.column_stack([difference, P[seen]]))
+        if not len(seen):
+            return mean, P, seen, weighed
+        K = weighed[:, 1:].T
         rest = np.eye(len(mean))
         rest[:, seen] -= K
-        return mean + K @ difference, rest @ P @ rest.T + K @ R @ K.T
+        return mean + K @ difference, rest @ P @ rest.T + K @ R @ K.T, seen, weighed
 
+    @QUIET
     def linearised(
         self, means: Float[np.ndarray, "k z"], u: Float[np.ndarray, "k m"]
     ) -> tuple[Float[np.ndarray, "k z"], Float[np.ndarray, "k z z"], Float[np.ndarray, "k z z"]]:
@@ -234,6 +251,7 @@ class ExtendedKalman(Estimator):
         mean, covariance = self.corrected(belief.mean, P, y)
         return replace(belief, mean=mean, covariance=covariance, y=y)
 
+    @QUIET
     def predict(self, belief: Belief, u: Float[np.ndarray, " m"]) -> Belief:
         """As the model says, less certain by what it does not know."""
         mean, F, Q = self.linearised(belief.mean[None], u[None])
@@ -247,97 +265,6 @@ class ExtendedKalman(Estimator):
         seen = np.flatnonzero(self.noise.measured)
         C, R = np.eye(self.n + self.d)[seen], np.diag(self.noise.measurement[seen] ** 2)
         return solve_dare(F[0].T, C.T, Q[0], R)
-
-
-class MovingHorizon(Estimator):
-    """Moving horizon estimation: the likeliest trajectory over the last samples.
-
-    Args:
-        system: the prediction model.
-        noise: what is not known.
-        step: sampling time [s].
-        substeps: RK4 steps in a sample.
-        window: number of samples before the present one.
-        iterations: Gauss–Newton steps at each sample.
-    """
-
-    def __init__(
-        self,
-        system: LagrangianSystem,
-        noise: Noise,
-        step: float,
-        substeps: int,
-        window: int,
-        iterations: int,
-    ) -> None:
-        super().__init__(system, noise, step, substeps, window)
-        self.window, self.iterations = window, iterations
-
-    def begin(self, y: Float[np.ndarray, " n"], start: Float[np.ndarray, " n"]) -> Belief:
-        """The first belief is the arrival cost."""
-        first = super().begin(y, start)
-        return replace(first, y=np.full(self.n, np.nan), arrival=(first.mean, first.covariance))
-
-    def predict(self, belief: Belief, u: Float[np.ndarray, " m"]) -> Belief:
-        """As the model says; a sample that leaves the window moves the arrival cost on."""
-        mean, F, Q = self.linearised(belief.mean[None], u[None])
-        window = (*belief.window, Sample(belief.mean, belief.y, u))
-        arrival = belief.arrival
-        assert arrival is not None
-        if len(window) > self.window:
-            oldest, window = window[0], window[1:]
-            prior, P = self.corrected(*arrival, oldest.y)
-            following, slope, added = self.linearised(oldest.mean[None], oldest.u[None])
-            arrival = (
-                following[0] + slope[0] @ (prior - oldest.mean),
-                slope[0] @ P @ slope[0].T + added[0],
-            )
-        covariance = F[0] @ belief.covariance @ F[0].T + Q[0]
-        return Belief(mean[0], covariance, np.full(self.n, np.nan), window, arrival)
-
-    def update(self, belief: Belief, y: Float[np.ndarray, " n"]) -> Belief:
-        """The likeliest trajectory that ends with these measurements."""
-        window = belief.window
-        assert belief.arrival is not None
-        if not window:
-            mean, covariance = self.corrected(*belief.arrival, y)
-            return replace(belief, mean=mean, covariance=covariance, y=y)
-        u = np.array([sample.u for sample in window])
-        points = np.array([sample.mean for sample in window])
-        mean, covariance = belief.mean, belief.covariance
-        try:
-            with np.errstate(all="ignore"):
-                for _ in range(self.iterations):
-                    points, mean, covariance = self._pass(points, window, u, belief.arrival, y)
-        except np.linalg.LinAlgError:  # the linearisation led to where nothing is finite
-            mean = np.full_like(mean, np.nan)
-        window = tuple(replace(s, mean=point) for s, point in zip(window, points, strict=True))
-        return replace(belief, mean=mean, covariance=covariance, y=y, window=window)
-
-    def _pass(
-        self,
-        points: Float[np.ndarray, "k z"],
-        window: tuple[Sample, ...],
-        u: Float[np.ndarray, "k m"],
-        arrival: tuple[NDArray[np.float64], NDArray[np.float64]],
-        y: Float[np.ndarray, " n"],
-    ) -> tuple[Float[np.ndarray, "k z"], Float[np.ndarray, " z"], Float[np.ndarray, "z z"]]:
-        """One Gauss–Newton step: filter forwards along the linearisation at `points`, smooth backwards."""
-        following, F, Q = self.linearised(points, u)
-        mean, P = arrival
-        filtered, predicted = [], []
-        for k, sample in enumerate(window):
-            mean, P = self.corrected(mean, P, sample.y)
-            filtered.append((mean, P))
-            mean, P = following[k] + F[k] @ (mean - points[k]), F[k] @ P @ F[k].T + Q[k]
-            predicted.append((mean, P))
-        mean, P = self.corrected(mean, P, y)
-        smoothed, later = np.empty_like(points), mean
-        for k in reversed(range(len(window))):
-            gain = np.linalg.lstsq(predicted[k][1], F[k] @ filtered[k][1], rcond=None)[0].T
-            later = filtered[k][0] + gain @ (later - predicted[k][0])
-            smoothed[k] = later
-        return smoothed, mean, P
 
 
 def unobservable(estimator: Estimator, x: Float[np.ndarray, " n"], u: Float[np.ndarray, " m"]) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,11 +15,14 @@ MOST_COORDINATES = 8
 """What the kernel has room for."""
 
 
-def pack_networks(system: LagrangianSystem) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+def pack_networks(
+    system: LagrangianSystem, driven: Sequence[int] | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
     """Integers (sizes and index lists) and numbers (scales and weights) of a system's networks.
 
     Args:
-        system: any; the coordinates that its inputs act on are packed too.
+        system: any.
+        driven: coordinates that inputs act on; those of the system's inputs if not given.
 
     Returns:
         None where the system is not made of structured networks, or is too large for the kernel.
@@ -26,11 +31,12 @@ def pack_networks(system: LagrangianSystem) -> tuple[NDArray[np.int64], NDArray[
     if networks is None or system.n > MOST_COORDINATES:
         return None
     layout = networks.spec.layout
-    driven = [i for i, c in enumerate(system.coordinates) if c.input is not None]
+    if driven is None:
+        driven = [i for i, c in enumerate(system.coordinates) if c.input is not None]
     return _integers(networks, layout, driven), _numbers(networks, layout)
 
 
-def _integers(networks: Networks, layout: Layout, driven: list[int]) -> NDArray[np.int64]:
+def _integers(networks: Networks, layout: Layout, driven: Sequence[int]) -> NDArray[np.int64]:
     coordinates = networks.spec.coordinates
     n, positions = len(coordinates), layout.positions
     first = np.cumsum([0, *layout.columns])  # each block has columns of L of its own
@@ -50,7 +56,7 @@ def _integers(networks: Networks, layout: Layout, driven: list[int]) -> NDArray[
         len(driven),
         layout.depth,
     ]
-    lists: list[list[int]] = [
+    lists: list[Sequence[int]] = [
         sizes,
         [positions.index(i) if i in positions else -1 for i in range(n)],
         positions,

@@ -33,7 +33,9 @@ def units(
     seen = curvature[np.isfinite(curvature) & (curvature > 0.0)]
     if not seen.size or seen.max() <= SPREAD * seen.min():
         return np.ones(len(H_end)), np.ones(len(H_u))
-    return _power_of_two(curvature), _power_of_two(np.diagonal(H_u + B.T @ H_end @ B))
+    with np.errstate(over="ignore", invalid="ignore"):  # such a curvature is not usable
+        by_input = np.diagonal(H_u + B.T @ H_end @ B)
+    return _power_of_two(curvature), _power_of_two(by_input)
 
 
 def _power_of_two(curvature: Float[np.ndarray, " k"]) -> NDArray[np.float64]:

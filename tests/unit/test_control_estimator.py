@@ -28,10 +28,10 @@ from exlinn_fmi.control.estimator import (
     Direct,
     Estimator,
     ExtendedKalman,
-    MovingHorizon,
     Noise,
     unobservable,
 )
+from exlinn_fmi.control.moving_horizon import MovingHorizon
 from exlinn_fmi.control.riccati import solve_dare
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.mechanics.coordinates import Coordinate
