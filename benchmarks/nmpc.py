@@ -31,6 +31,8 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.control.batch import Batch
 from exlinn_fmi.control.compiled import Kernel
+from exlinn_fmi.control.estimator import Estimator, ExtendedKalman, Noise
+from exlinn_fmi.control.moving_horizon import MovingHorizon
 from exlinn_fmi.control.realtime import CompiledGaussNewton
 from exlinn_fmi.control.reference import References
 from exlinn_fmi.control.solver import Plan, Solver, SolveStatus, make_solver
@@ -205,6 +207,38 @@ def scaling(quick: bool) -> Figures:
     return {"scaling.N300_over_N30": longer / base, "scaling.width256_over_width32": wider / base}
 
 
+def estimate(quick: bool) -> Figures:
+    """A sample of the estimators, angle and current measured; `mhe` over 10 samples in 2 iterations."""
+    pin()
+    system, loop = problem().ocp.system, closed_loop(problem(), Kernel(problem().ocp, 50, 1e-8, True), 300)
+    spread = np.array([1e-3, 1.0, 1e-2])
+    spec = Noise(
+        measured=np.array([True, False, True]),
+        measurement=spread,
+        process=np.zeros(3),
+        force=np.full(2, 0.01),
+        disturbed=np.array([0]),
+        walk=np.array([0.5]),
+        first=np.append(spread, 1.0),
+    )
+    makers = {
+        "ekf": ExtendedKalman(system, spec, STEP, 1),
+        "mhe": MovingHorizon(system, spec, STEP, 1, 10, 2, "compiled"),
+        "mhe_plain": MovingHorizon(system, spec, STEP, 1, 10, 2, "casadi"),
+    }
+    figures: Figures = {}
+    for name, made in makers.items():
+        beliefs, spent = [made.begin(loop.states[0], START)], []
+        for y, aim in zip(loop.states[1:], loop.aims, strict=False):
+
+            def sample(y: NDArray[np.float64] = y, aim: References = aim, made: Estimator = made) -> None:
+                beliefs[0] = made.update(made.predict(beliefs[0], aim.u[0]), y)  # noqa: B023
+
+            spent.append(seconds(sample))
+        figures |= microseconds(np.array(spent[20:]), f"estimate.{name}")
+    return figures
+
+
 # ── memory ───────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -238,6 +272,7 @@ def memory(quick: bool) -> Figures:
 FIGURES: dict[str, Callable[[bool], Figures]] = {
     "speed": speed,
     "cold": cold,
+    "estimate": estimate,
     "scaling": scaling,
     "memory": memory,
     **agreement.FIGURES,
@@ -255,6 +290,7 @@ BARS: dict[str, tuple[float, float]] = {
     "agree.max_dv_converged": (1e-4, 1e-4),
     "agree.failures": (0, 0),
     "cold.failures": (0, 0),
+    "estimate.mhe_us": (1000, 200),
     "memory.blocks_per_step": (0, 0),
 }
 """What a figure must reach, and what it should; ratios to peers at least, all else at most."""
