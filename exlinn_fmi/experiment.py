@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from exlinn_fmi.components.base import Component
+from exlinn_fmi.components.base import Component, Number
 from exlinn_fmi.data.files import write_table
 from exlinn_fmi.workspace import Run
 
@@ -32,7 +32,7 @@ def cosimulate(
     components: Mapping[str, Component],
     connections: Sequence[tuple[str, str]],
     span: Simulate,
-    starts: Mapping[str, Mapping[str, float]],
+    starts: Mapping[str, Mapping[str, Number]],
     store: Store | None = None,
 ) -> Trajectories:
     """Step components in lockstep over `span`, with progress and Ctrl-C minded."""

@@ -32,6 +32,9 @@ VariableType = Literal["Real", "Integer", "Boolean", "Enumeration", "String", "B
 TEXT_TYPES: tuple[VariableType, ...] = ("String", "Binary")
 """Types whose values are numbers that stand for texts, see `components.texts`."""
 
+Number = float | int
+"""A number; a whole one that float64 does not hold is an int."""
+
 Values = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
@@ -70,14 +73,17 @@ class Variable:
         causality: as in FMI.
         variability: as in FMI.
         unit: SI unit as text, None where the component states none, ``"1"`` for dimensionless.
-        type: how the values are meant; all travel as float64 (booleans 0/1, integers exact to 2⁵³, texts and
-            binaries as numbers that `components.texts` gives them).
+        type: how the values are meant; all travel as float64 (booleans 0/1, integers rounded beyond 2⁵³,
+            texts and binaries as numbers that `components.texts` gives them).
         start: start value, None where there is none.
         description: one line.
         depends_on: for an output, the inputs it depends on directly; None where the component does not say.
         min: least value that makes sense, None where the component states none.
         max: greatest value that makes sense, None where the component states none.
         si: what the unit is in SI base units, None where the component does not define it.
+        wide: type of whole numbers of 64 bits, of which float64 does not hold all. What it lacks of the value
+            of variable k, the *rest*, is set and got at index k + `len(variables)`, in one call with the
+            value.
     """
 
     name: str
@@ -85,12 +91,13 @@ class Variable:
     variability: Variability = "continuous"
     unit: str | None = None
     type: VariableType = "Real"
-    start: float | None = None
+    start: Number | None = None
     description: str = ""
     depends_on: tuple[str, ...] | None = ()
-    min: float | None = None
-    max: float | None = None
+    min: Number | None = None
+    max: Number | None = None
     si: SiUnit | None = None
+    wide: Literal["int64", "uint64"] | None = None
 
 
 class Component(ABC):
@@ -122,7 +129,7 @@ class Component(ABC):
 
     @abstractmethod
     def enter_initialization(
-        self, start_time: float, stop_time: float, starts: Mapping[str, float]
+        self, start_time: float, stop_time: float, starts: Mapping[str, Number]
     ) -> Status:
         """Prepare for a run from `start_time` to `stop_time` [s] with start values by variable name.
 

@@ -77,6 +77,7 @@ class Effect:
         schedule: when events are active.
         k: number of the event.
         smooth: whether values between two samples make sense.
+        rest: whether what it is done to is the rest of a value, see `Variable.wide`: what is set has none.
 
     Attributes:
         kind: see `Event.effect`.
@@ -84,13 +85,17 @@ class Effect:
             ``hold`` and ``drop`` keep, not a number where that is nothing.
     """
 
-    def __init__(self, schedule: Schedule, k: int, smooth: bool) -> None:
-        self._schedule, self._k, self._smooth = schedule, k, smooth
+    def __init__(self, schedule: Schedule, k: int, smooth: bool, rest: bool = False) -> None:
+        self._schedule, self._k, self._smooth, self._rest = schedule, k, smooth, rest
         event = schedule.events[k]
         self.kind = event.effect
-        self._number = float(getattr(event, event.effect) or 0.0)
+        self._number = 0.0 if rest and self.kind == "set" else float(getattr(event, event.effect) or 0.0)
         self.cell: Values = np.full(1, math.nan if self.kind in ("hold", "drop") else self._number)
         self._history: list[tuple[float, float]] = []
+
+    def afresh(self) -> Effect:
+        """The same, at the beginning."""
+        return Effect(self._schedule, self._k, self._smooth, self._rest)
 
     def state(self, t: float) -> State:
         """What it does at t [s], see `native.Change`."""

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
+from exlinn_fmi.components.base import Component, Indices, Number, Status, Values, Variable
 from exlinn_fmi.components.effects import Effect, Schedule
 from exlinn_fmi.components.native import Native
 from exlinn_fmi.components.wrapper import Wrapper
@@ -52,7 +52,11 @@ class Touched(Wrapper):
                 place = places[event.variable]
                 effect = Effect(schedule, k, inner.variables[place].type == "Real")
                 self._effects.setdefault(place, []).append(effect)
-        self._own = [k for k in self._effects if inner.variables[k].causality in ("input", "parameter")]
+                if inner.variables[place].wide is not None:
+                    rest = self._effects.setdefault(place + len(inner.variables), [])
+                    rest.append(Effect(schedule, k, smooth=False, rest=True))
+        kinds = {k: inner.variables[k % len(inner.variables)].causality for k in self._effects}
+        self._own = [k for k, kind in kinds.items() if kind in ("input", "parameter")]
         self._given = dict.fromkeys(self._own, 0.0)  # values as they come, before anything happens to them
         self._connected: set[int] = set()
         self._touching: dict[bytes, list[tuple[int, int]]] = {}
@@ -60,14 +64,14 @@ class Touched(Wrapper):
         self._put: tuple[list[int], bytes] | None = None  # what was set last that is not connected
 
     def enter_initialization(
-        self, start_time: float, stop_time: float, starts: Mapping[str, float]
+        self, start_time: float, stop_time: float, starts: Mapping[str, Number]
     ) -> Status:
         """As the inner component; what it starts with is noted."""
         status = self.inner.enter_initialization(start_time, stop_time, starts)
         self.schedule.restart()
         self._time, self.lag, self._arrived, self._put = start_time, 0.0, -math.inf, None
         for place, effects in self._effects.items():
-            self._effects[place] = [Effect(self.schedule, e._k, e._smooth) for e in effects]
+            self._effects[place] = [effect.afresh() for effect in effects]
         if self._own and status < Status.DISCARD:
             values = np.zeros(len(self._own))
             status = max(status, self.inner.get(np.array(self._own, dtype=np.intp), values))
@@ -237,7 +241,7 @@ class Monitor(Component):
         return True
 
     def enter_initialization(
-        self, start_time: float, stop_time: float, starts: Mapping[str, float]
+        self, start_time: float, stop_time: float, starts: Mapping[str, Number]
     ) -> Status:
         """Begin."""
         self._time = start_time

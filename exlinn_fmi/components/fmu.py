@@ -1,7 +1,7 @@
 """Functional Mock-up Units as components: FMI 1.0, 2.0 and 3.0 Co-Simulation, 2.0 and 3.0 Model Exchange.
 
 FMPy loads them. Variables of all types travel as float64, texts and binaries by number (`texts`); arrays are
-taken apart into their elements. Whole numbers beyond 2⁵³ are rounded, with a warning.
+taken apart into their elements. What float64 lacks of whole numbers of 64 bits is at indices of its own.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
+from exlinn_fmi.components.base import Component, Indices, Number, Status, Values, Variable
 from exlinn_fmi.components.cache import Lease
 from exlinn_fmi.components.fmu_calls import FmuNative
 from exlinn_fmi.components.fmu_description import FmuDescription
@@ -50,7 +50,7 @@ class FmuSettings:
     interface: Kind | None = None
     solver: str = "auto"
     tolerance: float | None = None
-    structure: Mapping[str, float] = field(default_factory=dict)
+    structure: Mapping[str, Number] = field(default_factory=dict)
 
     def describe(self, path: Path) -> FmuDescription:
         """The description of an FMU that is used like this.
@@ -111,12 +111,12 @@ class FmuComponent(Component):
         self._failed = Status.OK  # or the error after which only a saved state or a fresh instance helps
         self._stepper: Stepper = OwnStep(self._instance)
         self._arrays = start_arrays(self.description)
-        self._held: Values = np.full(len(self.variables), np.nan)
+        self._held: Values = np.full(2 * len(self.variables), np.nan)  # rests included
 
     # ── initialisation ───────────────────────────────────────────────────────────────────────────────────
 
     def enter_initialization(
-        self, start_time: float, stop_time: float, starts: Mapping[str, float]
+        self, start_time: float, stop_time: float, starts: Mapping[str, Number]
     ) -> Status:
         """Set start values and enter Initialization Mode, on a fresh instance after a run.
 
@@ -195,8 +195,8 @@ class FmuComponent(Component):
         plan = self._plans.get(key)
         if plan is None:
             for k in indices:
-                if not self._settable(self.variables[k]):
-                    self.message = f"{self.variables[k].name} cannot be set while {self._phase}"
+                if not self._settable(self._variable(k)):
+                    self.message = f"{self._variable(k).name} cannot be set while {self._phase}"
                     return Status.ERROR
             plan = self._plans[key] = self._plan("Set", indices)
         worst, doing = Status.OK, plan.groups
@@ -211,7 +211,7 @@ class FmuComponent(Component):
         for group in doing:
             refused = group.fill(values)
             if refused is not None:
-                variable = self.variables[indices[refused]]
+                variable = self._variable(indices[refused])
                 self.message = f"{variable.name} is of type {variable.type}: cannot be {values[refused]:g}"
                 return Status.ERROR
             if worst >= Status.ERROR:
@@ -240,18 +240,17 @@ class FmuComponent(Component):
                 worst = max(worst, self._check(f"Get{group.accessor}", code))
                 if code not in (Status.OK, Status.WARNING) and group.accessor in TEXTS:
                     continue  # what its pointers point to is anybody's guess
-            inexact = group.take(values)
-            if inexact is not None:
-                self.message = (
-                    f"{self.variables[indices[inexact]].name} is a whole number beyond 2^53 and was rounded"
-                )
-                worst = max(worst, Status.WARNING)
+            group.take(values)
         return worst
+
+    def _variable(self, index: int) -> Variable:
+        """The variable that an index stands for, be it of its value or of its rest."""
+        return self.variables[index % len(self.variables)]
 
     def _plan(self, verb: str, indices: Indices) -> _Plan:
         """The C calls for these variables."""
         stepping = self._phase == "stepping" and self._stepper.has_events and verb == "Set"
-        waits = np.array([stepping and self._waits(self.variables[k]) for k in indices], dtype=bool)
+        waits = np.array([stepping and self._waits(self._variable(k)) for k in indices], dtype=bool)
         eventful, at_once = np.flatnonzero(waits), np.flatnonzero(~waits)
         everything = self.description, self._instance, self._arrays, verb, indices
         return _Plan(groups(*everything, at_once), groups(*everything, eventful), eventful)

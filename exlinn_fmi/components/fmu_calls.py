@@ -10,7 +10,7 @@ import numpy as np
 from exlinn_fmi.components.base import Indices, Status
 from exlinn_fmi.components.fmu_description import FmuDescription
 from exlinn_fmi.components.fmu_native import Instance, address, reference_buffer, value_buffer
-from exlinn_fmi.components.fmu_values import Arrays, by_call
+from exlinn_fmi.components.fmu_values import Arrays, by_call, rests_of
 from exlinn_fmi.components.native import Native, NativeAccess
 
 
@@ -71,6 +71,7 @@ class FmuNative(Native):
             positions=positions,
             array=whole,
             elements=elements,
+            rests=rests_of(d, indices, positions),
         )
 
     def heed(self, function: str, code: int) -> Status:

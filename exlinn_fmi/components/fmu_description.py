@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 
 import fmpy
 
-from exlinn_fmi.components.base import Causality, SiUnit, Variability, Variable, VariableType
+from exlinn_fmi.components.base import Causality, Number, SiUnit, Variability, Variable, VariableType
 from exlinn_fmi.components.fmu_interfaces import Interface, Kind, choose_interface, read_interfaces
 from exlinn_fmi.components.texts import handle
 from exlinn_fmi.errors import FmuError
@@ -41,6 +41,9 @@ _TYPES: dict[str, VariableType] = {
     "String": "String",
     "Binary": "Binary",
 }
+
+
+_WIDE: dict[str, Literal["int64", "uint64"]] = {"Int64": "int64", "UInt64": "uint64"}
 
 
 @dataclass(frozen=True)
@@ -142,7 +145,7 @@ def describe(
     model: Any,
     root: ElementTree.Element,
     kind: Kind | None = None,
-    starts: Mapping[str, float] | None = None,
+    starts: Mapping[str, Number] | None = None,
 ) -> FmuDescription:
     """Our description from FMPy's.
 
@@ -212,7 +215,7 @@ def _key(version: int, v: Any) -> _Key:
     return ("Int64" if version == 3 else "Integer") if v.type == "Enumeration" else v.type, v.valueReference
 
 
-def _shape(v: Any, structure: Mapping[str, float]) -> tuple[int, ...]:
+def _shape(v: Any, structure: Mapping[str, Number]) -> tuple[int, ...]:
     """Dimensions of an array; none for a scalar."""
     return tuple(
         int(d.start) if d.start is not None else int(structure[d.variable.name]) for d in v.dimensions
@@ -223,7 +226,7 @@ _Part = tuple[Variable, _Key, int, int]
 
 
 def _parts(
-    path: Path, version: int, known: Iterable[Any], structure: Mapping[str, float], root: ElementTree.Element
+    path: Path, version: int, known: Iterable[Any], structure: Mapping[str, Number], root: ElementTree.Element
 ) -> Iterator[_Part]:
     """Every scalar and every element of an array: variable, key, place and size.
 
@@ -244,7 +247,7 @@ def _parts(
             raise FmuError(f"{path}: variable {v.name!r} has dimensions {shape}: more than can be held")
         try:
             given = texts[v.name] if v.name in texts else (v.start or "").split() if shape else [v.start]
-            starts: list[float | None] = [_start(v, text) for text in given]
+            starts: list[Number | None] = [_start(v, text) for text in given]
             if len(starts) != size:
                 starts = starts * size if len(starts) == 1 else [None] * size
             if v.causality == "structuralParameter":
@@ -257,7 +260,7 @@ def _parts(
             yield one(name, starts[k]), _key(version, v), k, size
 
 
-def _start(v: Any, text: str | None) -> float | None:
+def _start(v: Any, text: str | None) -> Number | None:
     if text is None:
         return None
     if v.type == "String":
@@ -310,7 +313,7 @@ def _variable(v: Any, units: Mapping[str, SiUnit]) -> Any:
         si = replace(si, offset=0.0)  # a difference of temperatures
     least, most = _number(low), _number(high)
 
-    def make(name: str, start: float | None) -> Variable:
+    def make(name: str, start: Number | None) -> Variable:
         return Variable(
             name=name,
             causality=causality,
@@ -322,6 +325,7 @@ def _variable(v: Any, units: Mapping[str, SiUnit]) -> Any:
             min=least,
             max=most,
             si=si,
+            wide=_WIDE.get(v.type),
         )
 
     return make
@@ -356,11 +360,14 @@ def _states(version: int, model: Any) -> tuple[tuple[int, ...], tuple[int, ...]]
     return tuple(v.derivative.valueReference for v in rates), tuple(v.valueReference for v in rates)
 
 
-def _number(text: str | int | None) -> float | None:
-    """A start value or bound of the XML as a number, booleans as 0 and 1."""
+def _number(text: str | int | None) -> Number | None:
+    """A start value or bound of the XML: an int where float64 may not hold it, booleans as 0 and 1."""
     if text is None:
         return None
-    return {"true": 1.0, "false": 0.0}[text] if text in ("true", "false") else float(text)
+    if text in ("true", "false"):
+        return float(text == "true")
+    number = float(text)
+    return int(text) if abs(number) > 2**53 and str(text).lstrip("+-").isdecimal() else number
 
 
 # ── clocks ───────────────────────────────────────────────────────────────────────────────────────────────

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from exlinn_fmi.components.base import Status, Values
+from exlinn_fmi.components.base import Number, Status, Values
 from exlinn_fmi.components.fmu import FmuComponent
 from exlinn_fmi.components.fmu_events import Stopped
 from exlinn_fmi.components.fmu_native import Refused, reference_buffer
@@ -25,7 +25,7 @@ def trajectory(
     times: ArrayLike,
     outputs: Sequence[str],
     inputs: Mapping[str, ArrayLike] | None = None,
-    starts: Mapping[str, float] | None = None,
+    starts: Mapping[str, Number] | None = None,
 ) -> Values:
     """Run an FMU through Model Exchange, with Dormand and Prince's method.
 

@@ -1,7 +1,8 @@
 """Values of FMU variables in and out: one C call per type, with buffers that are ready.
 
-Numbers are converted to and from float64. An element of an array travels with its whole array, which is kept
-from call to call: FMI 3 sets and gets arrays as a whole. Texts and binaries are told by number (`texts`).
+Numbers are converted to and from float64, those of 64 bits in two parts (`wide`). An element of an array
+travels with its whole array, which is kept from call to call: FMI 3 sets and gets arrays as a whole. Texts
+and binaries are told by number (`texts`).
 """
 
 from __future__ import annotations
@@ -17,9 +18,7 @@ from exlinn_fmi.components.base import Indices, Values
 from exlinn_fmi.components.fmu_description import FmuDescription
 from exlinn_fmi.components.fmu_native import Instance, reference_buffer, value_buffer
 from exlinn_fmi.components.texts import handle, text
-
-EXACT = 2.0**53
-"""Whole numbers beyond it are not all held by float64."""
+from exlinn_fmi.components.wide import fits, joined, rest_of
 
 TEXTS = ("String", "Binary")
 """Accessors of what is told by number."""
@@ -48,17 +47,25 @@ class Group(ABC):
         """Put values into the buffer; gives the position of the first that its type cannot hold."""
 
     @abstractmethod
-    def take(self, values: Values) -> int | None:
-        """Put the buffer into the values; gives the position of the first that is too large to be exact."""
+    def take(self, values: Values) -> None:
+        """Put the buffer into the values."""
 
 
 class Numbers(Group):
     """Numbers of one type: scalars, or elements of one array."""
 
     def __init__(
-        self, instance: Instance, verb: str, accessor: str, references: list[int], positions: Any, array: Any
+        self,
+        instance: Instance,
+        verb: str,
+        accessor: str,
+        references: list[int],
+        positions: Any,
+        array: Any,
+        rests: Any,
     ) -> None:
         self.accessor, self.positions = accessor, positions
+        self._rests, self._kind = rests, accessor.lower()
         self._references = reference_buffer(references)
         elements, whole = array if array is not None else (slice(None), None)
         self.buffer = (
@@ -68,7 +75,6 @@ class Numbers(Group):
         self.function, self.arguments = instance.accessor(verb, accessor, self._references, self.buffer)
         self._double = self.buffer.dtype == np.float64
         self._boolean = accessor == "Boolean"
-        self._wide = accessor in ("Int64", "UInt64")
 
     def fill(self, values: Values) -> int | None:
         """See `Group`."""
@@ -76,6 +82,14 @@ class Numbers(Group):
         if self._double:
             self.buffer[self._elements] = given
             return None
+        if self._rests is not None:
+            at, places = self._rests
+            rest = np.zeros(len(given))
+            rest[at] = values[places]
+            wrong = np.flatnonzero(~fits(given, rest, self._kind))
+            if not wrong.size:
+                self.buffer[self._elements] = joined(given, rest, self._kind)
+            return self._place(values, wrong[0]) if wrong.size else None
         with np.errstate(invalid="ignore", over="ignore"):
             self.buffer[self._elements] = given.astype(bool) if self._boolean else given
         if self.buffer.dtype == np.float32:
@@ -83,13 +97,13 @@ class Numbers(Group):
         refused = np.flatnonzero(self.buffer[self._elements] != given)
         return self._place(values, refused[0]) if refused.size else None
 
-    def take(self, values: Values) -> int | None:
+    def take(self, values: Values) -> None:
         """See `Group`."""
         got = self.buffer[self._elements]
         values[self.positions] = got
-        if self._wide and (large := np.flatnonzero((got > EXACT) | (got < -EXACT))).size:
-            return self._place(values, large[0])
-        return None
+        if self._rests is not None:
+            at, places = self._rests
+            values[places] = rest_of(got[at])
 
     def _place(self, values: Values, k: int) -> int:
         return int(np.arange(len(values))[self.positions][k])
@@ -99,7 +113,14 @@ class Texts(Group):
     """Texts or binaries, scalars and arrays alike."""
 
     def __init__(
-        self, instance: Instance, verb: str, accessor: str, references: list[int], positions: Any, array: Any
+        self,
+        instance: Instance,
+        verb: str,
+        accessor: str,
+        references: list[int],
+        positions: Any,
+        array: Any,
+        rests: Any,
     ) -> None:
         self.accessor, self.positions = accessor, positions
         self._references = reference_buffer(references)
@@ -126,7 +147,7 @@ class Texts(Group):
         self._sizes[:] = [len(value) for value in data]
         return None
 
-    def take(self, values: Values) -> int | None:
+    def take(self, values: Values) -> None:
         """See `Group`."""
         for k, place in enumerate(self._elements):
             pointer, size = int(self._pointers[place]), int(self._sizes[place])
@@ -136,7 +157,6 @@ class Texts(Group):
                 value = ctypes.string_at(pointer).decode("utf-8", "replace") if pointer else ""
             self._whole[place] = handle(value)
             values[self._where(values, k)] = self._whole[place]
-        return None
 
     def _encoded(self, value: str | bytes) -> bytes:
         """As C wants it; a binary that is given as text is in hexadecimal digits."""
@@ -149,12 +169,21 @@ class Texts(Group):
 
 
 def by_call(description: FmuDescription, indices: Indices) -> dict[tuple[str, int | None], list[int]]:
-    """Positions in `indices` by C call: scalars by accessor, each array by itself."""
+    """Positions in `indices` by C call: scalars by accessor, each array by itself; rests are left out."""
     positions: dict[tuple[str, int | None], list[int]] = {}
     for position, k in enumerate(indices):
-        alone = description.references[k] if is_array(description, k) else None
-        positions.setdefault((description.accessors[k], alone), []).append(position)
+        if k < len(description.variables):
+            alone = description.references[k] if is_array(description, k) else None
+            positions.setdefault((description.accessors[k], alone), []).append(position)
     return positions
+
+
+def rests_of(description: FmuDescription, indices: Indices, positions: Indices) -> list[tuple[int, int]]:
+    """Of values at `positions` in `indices` whose rest is there: number in `positions`, place of the rest."""
+    count = len(description.variables)
+    places = {int(k) - count: place for place, k in enumerate(indices) if k >= count}
+    values = [int(k) for k in indices[positions]] if places else []
+    return [(number, places[k]) for number, k in enumerate(values) if k in places]
 
 
 def is_array(description: FmuDescription, k: int) -> bool:
@@ -176,15 +205,17 @@ def groups(
         where = chosen[places]
         positions: Any = slice(None) if len(where) == len(indices) else where
         kind = Texts if accessor in TEXTS else Numbers
+        pairs = rests_of(description, indices, where)
+        rests = tuple(np.array(part) for part in zip(*pairs, strict=True)) if pairs else None
         if reference is None:
             references = [description.references[k] for k in indices[where]]
-            made.append(kind(instance, verb, accessor, references, positions, None))
+            made.append(kind(instance, verb, accessor, references, positions, None, rests))
         else:
             elements = np.array([description.elements[k] for k in indices[where]], dtype=np.intp)
             whole = arrays[accessor, reference]
             if verb == "Get":
                 whole = whole.copy()
-            made.append(kind(instance, verb, accessor, [reference], positions, (elements, whole)))
+            made.append(kind(instance, verb, accessor, [reference], positions, (elements, whole), rests))
     return made
 
 

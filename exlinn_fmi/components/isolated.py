@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from exlinn_fmi import errors
-from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
+from exlinn_fmi.components.base import Component, Indices, Number, Status, Values, Variable
 from exlinn_fmi.components.fmu import FmuComponent, FmuSettings, read_variables
 from exlinn_fmi.components.process import PATIENCE, LostError, Process
 from exlinn_fmi.components.texts import handle, text
@@ -107,12 +107,15 @@ class IsolatedComponent(Component):
         return self._saves
 
     def enter_initialization(
-        self, start_time: float, stop_time: float, starts: Mapping[str, float]
+        self, start_time: float, stop_time: float, starts: Mapping[str, Number]
     ) -> Status:
         """As the component itself."""
         self._pending, self._undoable, self._time = -1, False, start_time
         texts = {self.variables[k].name for k in self._texts}
-        given = {n: self._sent(float(v)) if n in texts else float(v) for n, v in starts.items()}
+        given = {
+            n: self._sent(float(v)) if n in texts else v if type(v) is int else float(v)
+            for n, v in starts.items()
+        }
         return self._status("enter_initialization", start_time, stop_time, given, what="initialisation")
 
     def exit_initialization(self) -> Status:

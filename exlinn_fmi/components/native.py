@@ -33,6 +33,7 @@ class NativeAccess:
         positions: which of the variables that were asked for it gets or sets, in this order.
         array: the whole array that the one reference stands for, where these are elements of one.
         elements: where in `array` they are.
+        rests: of values with a rest: number in `positions`, and which of the variables asked for the rest is.
     """
 
     name: str
@@ -45,6 +46,7 @@ class NativeAccess:
     positions: Indices
     array: NDArray[Any] | None = None
     elements: Indices | None = None
+    rests: Sequence[tuple[int, int]] = ()
 
 
 @dataclass(frozen=True)

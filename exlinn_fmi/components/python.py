@@ -47,7 +47,7 @@ from typing import Any
 
 import numpy as np
 
-from exlinn_fmi.components.base import Component, Indices, Status, Values, Variable
+from exlinn_fmi.components.base import Component, Indices, Number, Status, Values, Variable
 from exlinn_fmi.components.packing import pack, unpack
 from exlinn_fmi.components.starts import check_starts, takes_start
 from exlinn_fmi.components.texts import handle, text
@@ -119,7 +119,7 @@ class PythonComponent(Component):
         return True
 
     def enter_initialization(
-        self, start_time: float, stop_time: float, starts: Mapping[str, float]
+        self, start_time: float, stop_time: float, starts: Mapping[str, Number]
     ) -> Status:
         """Take all start values and begin.
 

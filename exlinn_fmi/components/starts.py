@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from exlinn_fmi.components.base import Variable
+from exlinn_fmi.components.base import Number, Variable
 from exlinn_fmi.errors import InputError, nearest
 
 
@@ -15,7 +15,7 @@ def takes_start(variable: Variable) -> bool:
     return given and variable.variability != "constant"
 
 
-def value_problem(variable: Variable, value: float) -> str | None:
+def value_problem(variable: Variable, value: Number) -> str | None:
     """Why a variable does not take a value, None where it does."""
     if not math.isfinite(value):
         return f"expected a finite number, found {value}"
@@ -23,14 +23,17 @@ def value_problem(variable: Variable, value: float) -> str | None:
         return f"is a Boolean: expected true or false, found {value:g}"
     if variable.type in ("Integer", "Enumeration") and value != math.floor(value):
         return f"is of type {variable.type}: expected a whole number, found {value:g}"
-    low = -math.inf if variable.min is None else variable.min
-    high = math.inf if variable.max is None else variable.max
+    widest = {"int64": (-(2**63), 2**63 - 1), "uint64": (0, 2**64 - 1)}.get(
+        variable.wide or "", (-math.inf, math.inf)
+    )
+    low = widest[0] if variable.min is None else variable.min
+    high = widest[1] if variable.max is None else variable.max
     if not low <= value <= high:
         return f"expected {_range(low, high, variable.unit)}, found {value:g}"
     return None
 
 
-def _range(low: float, high: float, unit: str | None) -> str:
+def _range(low: Number, high: Number, unit: str | None) -> str:
     """Bounds in words."""
     suffix = f" {unit}" if unit else ""
     if high == math.inf:
@@ -41,9 +44,9 @@ def _range(low: float, high: float, unit: str | None) -> str:
 
 
 def check_starts(
-    component: str, variables: Sequence[Variable], starts: Mapping[str, float]
+    component: str, variables: Sequence[Variable], starts: Mapping[str, Number]
 ) -> dict[int, float]:
-    """Start values by index of the variable, all of them checked.
+    """Start values by index of the variable, rests of wide ones included, all of them checked.
 
     Args:
         component: name of the component, for the message.
@@ -66,10 +69,12 @@ def check_starts(
         if not takes_start(variable):
             why = "a constant" if variable.variability == "constant" else "calculated by the component"
             problems.append(f"{component}.{name}: is {why} and takes no start value")
-        elif (problem := value_problem(variable, float(value))) is not None:
+        elif (problem := value_problem(variable, value)) is not None:
             problems.append(f"{component}.{name}: {problem}")
         else:
             values[index[name]] = float(value)
+            if variable.wide is not None and value == int(value):
+                values[index[name] + len(variables)] = float(int(value) - int(float(value)))
     if problems:
         raise InputError("\n".join(problems))
     return values

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
-from exlinn_fmi.components.base import Component, Indices, Status, Values
+from exlinn_fmi.components.base import Component, Indices, Number, Status, Values
 from exlinn_fmi.components.native import Change, Native, NativeAccess
 
 
@@ -36,7 +36,7 @@ class Wrapper(Component):
         return self.inner.can_save_state
 
     def enter_initialization(
-        self, start_time: float, stop_time: float, starts: Mapping[str, float]
+        self, start_time: float, stop_time: float, starts: Mapping[str, Number]
     ) -> Status:
         """As the inner component."""
         return self.inner.enter_initialization(start_time, stop_time, starts)

@@ -23,7 +23,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from exlinn_fmi.components.base import Component, Indices, Status, Values
+from exlinn_fmi.components.base import Component, Indices, Number, Status, Values
 from exlinn_fmi.components.packing import pack, unpack
 from exlinn_fmi.control.defaults import completed, estimator, measure, refined
 from exlinn_fmi.control.diagnosis import diagnose
@@ -163,7 +163,7 @@ class NmpcController(Component):
         return True
 
     def enter_initialization(
-        self, start_time: float, stop_time: float, starts: Mapping[str, float]
+        self, start_time: float, stop_time: float, starts: Mapping[str, Number]
     ) -> Status:
         """Begin afresh; `starts` may give states that nothing is connected to, or that are not measured.
 

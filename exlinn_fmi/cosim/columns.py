@@ -8,30 +8,42 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from exlinn_fmi.components.base import TEXT_TYPES, Variable
+from exlinn_fmi.components.base import TEXT_TYPES
 from exlinn_fmi.components.texts import text
+from exlinn_fmi.components.wide import joined
+from exlinn_fmi.cosim.graph import Graph
+from exlinn_fmi.cosim.order import Port
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Kind = Literal["number", "text"]
+Kind = Literal["number", "text", "int64", "uint64", "rest"]
 
 
-def kind_of(variable: Variable) -> Kind:
-    """What a column of a variable's values holds."""
-    return "text" if variable.type in TEXT_TYPES else "number"
+def kinds_of(graph: Graph, recorded: Sequence[Port]) -> list[Kind]:
+    """What the columns of recorded variables hold, and those of rests, which come after all of them."""
+    kinds: list[Kind] = []
+    for port in recorded:
+        variable = graph.variable(port)
+        whole = variable.wide if graph.rest(port) is not None else None
+        kinds.append("text" if variable.type in TEXT_TYPES else whole or "number")
+    kinds += ["rest"] * sum(kind in ("int64", "uint64") for kind in kinds)
+    return kinds
 
 
 class Columns:
     """Makes frames of rows.
 
     Args:
-        names: of the columns.
-        kinds: what each holds; numbers if not given.
+        names: of the columns, one by one.
+        kinds: what each holds; numbers if not given. Columns of rests have no names.
     """
 
     def __init__(self, names: Sequence[str], kinds: Sequence[Kind] = ()) -> None:
         self.names, self.kinds = list(names), list(kinds) or ["number"] * len(names)
+
+    def __len__(self) -> int:
+        return len(self.kinds)
 
     def frame(self, rows: NDArray[np.float64], copy: bool = False) -> pd.DataFrame:
         """Rows (n, columns) as a frame: texts as such, binaries as bytes."""
@@ -39,11 +51,14 @@ class Columns:
 
         if not any(kind != "number" for kind in self.kinds):
             return pd.DataFrame(rows, columns=self.names, copy=copy)
-        columns = {
-            name: _texts(column) if kind == "text" else column.copy()
-            for name, kind, column in zip(self.names, self.kinds, rows.T, strict=True)
-        }
-        return pd.DataFrame(columns)
+        rests = iter(rows.T[[kind == "rest" for kind in self.kinds]])
+        made: list[NDArray[Any]] = []
+        for kind, column in zip(self.kinds, rows.T, strict=True):
+            if kind in ("int64", "uint64"):
+                made.append(joined(column, next(rests), kind))
+            elif kind != "rest":
+                made.append(_texts(column) if kind == "text" else column.copy())
+        return pd.DataFrame(dict(zip(self.names, made, strict=True)))
 
 
 def _texts(column: NDArray[np.float64]) -> NDArray[Any]:

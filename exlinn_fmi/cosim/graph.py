@@ -56,6 +56,7 @@ class Graph:
         self._parts = tuple(self.components.values())
         self._numbers = [{v.name: k for k, v in enumerate(c.variables)} for c in self._parts]
         self.connections = self._check(connections)
+        self._sources = {i: o for o, i in self.connections}
         wiring = self._wiring()
         broken = break_loops(wiring)
         self.visits: tuple[Visit, ...] = tuple(visits(len(self.names), wiring, broken))
@@ -68,8 +69,16 @@ class Graph:
     # ── ports ────────────────────────────────────────────────────────────────────────────────────────────
 
     def variable(self, port: Port) -> Variable:
-        """The variable that a port stands for."""
-        return self._parts[port[0]].variables[port[1]]
+        """The variable that a port stands for, be it of its value or of its rest."""
+        variables = self._parts[port[0]].variables
+        return variables[port[1] % len(variables)]
+
+    def rest(self, port: Port) -> Port | None:
+        """The port of what float64 lacks of a value, see `Variable.wide`; None where that is not told."""
+        source = self._sources.get(port, port)
+        if self.variable(port).wide is None or self.variable(source).wide is None:
+            return None
+        return port[0], port[1] + len(self._parts[port[0]].variables)
 
     def path(self, port: Port) -> str:
         """A port as ``component.variable``."""

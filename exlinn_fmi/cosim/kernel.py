@@ -47,10 +47,13 @@ REASONS = 8
 
 # Kinds of moves between memory cells: as they are, from float64 to a type, from a type to float64; or what is
 # in the target is scaled by what is read, or that added to it, or held: it is what is read, or is kept there
-# where that is not a number.
-FROM, HOLD, SCALE, ADD = 16, 13, 14, 15
+# where that is not a number. Whole numbers of 64 bits (REST) are stored upon their rest, which is in the
+# target already; what is loaded as such is the rest.
+FROM, HOLD, SCALE, ADD = 32, 13, 14, 15
 TYPES = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "truth1", "truth4")
 F8, F4, I1, U1, I2, U2, I4, U4, I8, U8, B1, B4 = range(12)
+REST = 8
+REST_I8, REST_U8 = I8 + REST, U8 + REST
 
 
 # ── C calls and memory, by address ───────────────────────────────────────────────────────────────────────
@@ -158,6 +161,11 @@ def _load(kind: int, at: int) -> float:  # pragma: no cover - compiled
         return float(_get_i8(at))
     if kind == U8:
         return float(_get_u8(at))
+    if kind in (REST_I8, REST_U8):
+        bits = _get_i8(at)
+        parts = bits >> 11 if kind == REST_I8 else bits >> 11 & (1 << 53) - 1
+        above, below = 2048.0 * parts, float(bits & 2047)
+        return below - (above + below - above)  # type: ignore[no-any-return]
     return float(_get_f8(at))
 
 
@@ -168,6 +176,15 @@ def _store(kind: int, value: float, at: int) -> bool:  # pragma: no cover - comp
         return True
     if kind == F4:
         _put_f4(at, value)
+        return True
+    if kind in (REST_I8, REST_U8):
+        rest, beyond = _get_i8(at), BEYOND[kind - REST]
+        if not (LOWEST[kind - REST] <= value <= beyond and np.floor(value) == value):
+            return False
+        if value == beyond and rest >= 0:
+            return False
+        parts = np.floor(value / 2048.0)
+        _put_8(at, int(parts) * 2048 + int(value - 2048.0 * parts) + rest)
         return True
     if not (LOWEST[kind] <= value < BEYOND[kind] and np.floor(value) == value):
         return False

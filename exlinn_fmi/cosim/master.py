@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from exlinn_fmi.components.base import Component, Values
+from exlinn_fmi.components.base import Component, Number, Values
 from exlinn_fmi.cosim.adaptive import Adaptive, AdaptiveOptions
-from exlinn_fmi.cosim.columns import Columns, Kind, kind_of
+from exlinn_fmi.cosim.columns import Columns, Kind, kinds_of
 from exlinn_fmi.cosim.extrapolation import ExtrapolationOptions
 from exlinn_fmi.cosim.graph import Graph
 from exlinn_fmi.cosim.loops import SOLVERS, LoopOptions
@@ -142,7 +142,7 @@ class Master:
 
     def run(
         self,
-        starts: Mapping[str, Mapping[str, float]] | None = None,
+        starts: Mapping[str, Mapping[str, Number]] | None = None,
         progress: Progress | None = None,
         should_stop: Callable[[], bool] | None = None,
         store: Store | None = None,
@@ -215,14 +215,13 @@ class Master:
         names = [TIME, *map(self.graph.path, self.recorded), *timing]
         stated = ["s", *(self.graph.variable(port).unit for port in self.recorded), *("s" for _ in timing)]
         units = {name: unit for name, unit in zip(names, stated, strict=True) if unit is not None}
-        file = None if store is None else store.row_file(self.ticks // self._every + 1, len(names))
-        variables = [self.graph.variable(port) for port in self.recorded]
-        kinds: list[Kind] = ["number", *map(kind_of, variables)]
+        kinds: list[Kind] = ["number", *kinds_of(self.graph, self.recorded)]
         kinds += ["number"] * len(timing)
+        file = None if store is None else store.row_file(self.ticks // self._every + 1, len(kinds))
         return Recorder(names, units, self.ticks, self._every, file, kinds)
 
     def _attempt(
-        self, plan: Plan, recorder: Recorder, starts: Mapping[str, Mapping[str, float]], watch: Watch
+        self, plan: Plan, recorder: Recorder, starts: Mapping[str, Mapping[str, Number]], watch: Watch
     ) -> RunError | None:
         """Step until the end or until something happens, which is returned."""
         try:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from exlinn_fmi.components.base import Component, Indices, Status, Values
+from exlinn_fmi.components.base import Component, Indices, Number, Status, Values
 from exlinn_fmi.components.texts import keep, kept
 from exlinn_fmi.cosim.exchange import Advance, Exchange, Warned
 from exlinn_fmi.cosim.extrapolation import Extrapolation, ExtrapolationOptions
@@ -92,6 +92,8 @@ class Plan:
 
         def piece(ports: Iterable[Port]) -> dict[Port, int]:
             nonlocal size
+            ports = list(ports)
+            ports += [rest for port in ports if (rest := graph.rest(port)) is not None]
             new = {port: size + k for k, port in enumerate(ports)}
             size += len(new)
             return new
@@ -117,8 +119,12 @@ class Plan:
         self._torn = list(holds)
 
         self.signals: Values = np.zeros(size)
-        self.columns = _indices([0, *(places[p] for p in recorded)])
+        rests = [rest for p in recorded if (rest := graph.rest(p)) is not None]
+        self.columns = _indices([0, *(places[p] for p in [*recorded, *rests])])
         self._source = {i: (holds if (o, i) in graph.delayed else places)[o] for o, i in graph.connections}
+        for o, i in graph.connections:
+            if (upper := graph.rest(o)) is not None and (lower := graph.rest(i)) is not None:
+                self._source[lower] = (holds if (o, i) in graph.delayed else places)[upper]
         self._constants = [self._exchange_of(_number(p), self.signals, {}, p) for p in constants]
         self._before_first = [self._exchange_of(_number(p), self.signals, {}, p) for p in held]
         self.hold_to = _indices(holds.values())
@@ -164,6 +170,8 @@ class Plan:
             and not (self.components[o[0]].sampled or self.components[i[0]].sampled)
             and (o, i) not in graph.delayed
         }
+        pairs = [(graph.rest(i), graph.rest(o)) for i, o in fresh.items()]
+        fresh |= {i: o for i, o in pairs if i is not None and o is not None}
         self._fresh = fresh
         ports = [*sorted(set(fresh.values())), *sorted(fresh)]
         place = {port: k for k, port in enumerate(ports)}
@@ -180,7 +188,7 @@ class Plan:
 
     # ── work ─────────────────────────────────────────────────────────────────────────────────────────────
 
-    def initialize(self, start: float, stop: float, starts: Mapping[str, Mapping[str, float]]) -> None:
+    def initialize(self, start: float, stop: float, starts: Mapping[str, Mapping[str, Number]]) -> None:
         """Initialise all components, with initial values passed through the connections.
 
         Args:
@@ -354,7 +362,7 @@ class Plan:
         """
         wrong = np.flatnonzero(~np.isfinite(x.taken))
         if wrong.size and x.outputs is not None:
-            variable = self.components[x.component].variables[int(x.outputs[wrong[0]])].name
+            variable = self.graph.variable((x.component, int(x.outputs[wrong[0]]))).name
             message = f"the value is {x.taken[wrong[0]]}, expected a finite number"
             raise ComponentError(self.graph.names[x.component], message, variable, t)
 

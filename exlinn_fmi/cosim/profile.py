@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from time import perf_counter
 
-from exlinn_fmi.components.base import Component, Indices, Status, Values
+from exlinn_fmi.components.base import Component, Indices, Number, Status, Values
 from exlinn_fmi.components.native import Native
 
 
@@ -39,7 +39,7 @@ class Timed(Component):
         return self._inner.can_save_state
 
     def enter_initialization(
-        self, start_time: float, stop_time: float, starts: Mapping[str, float]
+        self, start_time: float, stop_time: float, starts: Mapping[str, Number]
     ) -> Status:
         """Not measured: it happens once."""
         return self._inner.enter_initialization(start_time, stop_time, starts)

@@ -253,7 +253,9 @@ class Program:
                 if kind is not None:
                     to = _addresses(values, call.elements)
                     cells = zip(_addresses(x.given, call.positions), to, strict=True)
-                    self._add_moves((kind, a, b) for a, b in cells)
+                    rests = {to[n]: _address(x.given[place:]) for n, place in call.rests}
+                    self._add_moves((k.I8, a, b) for b, a in rests.items())
+                    self._add_moves((kind + k.REST * (b in rests), a, b) for a, b in cells)
                 columns = {**who, **_arguments(call, values), k.FIRST: first, k.LAST: len(self._moves)}
                 act = Act("setting inputs", call.name, native, x, vector, more=len(calls) - n)
                 line = self._add(k.SET, columns, act)
@@ -268,6 +270,8 @@ class Program:
                     out = _addresses(values, call.elements)
                     cells = zip(out, _addresses(x.taken, call.positions), strict=True)
                     self._add_moves((kind + k.FROM, a, b) for a, b in cells)
+                    rest = kind + k.REST + k.FROM
+                    self._add_moves((rest, out[n], _address(x.taken[place:])) for n, place in call.rests)
                 if n == len(calls):
                     self._add_changes(x, "Get", ahead)
                 columns = {**who, **_arguments(call, values), k.FIRST: first, k.LAST: len(self._moves)}

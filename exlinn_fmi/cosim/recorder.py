@@ -102,9 +102,9 @@ class Recorder:
         rows = ticks // every + 1
         try:
             here = rows if file is None else min(rows, file.block)
-            self.table: NDArray[np.float64] = np.empty((here, len(names)))
+            self.table: NDArray[np.float64] = np.empty((here, len(self.columns)))
         except (MemoryError, ValueError) as error:
-            size = f"{rows} rows of {len(names)} columns ({8e-9 * rows * len(names):.3g} GB)"
+            size = f"{rows} rows of {len(self.columns)} columns ({8e-9 * rows * len(self.columns):.3g} GB)"
             raise InputError(
                 f"{size} do not fit into memory; record fewer variables, take a longer step, stop earlier or "
                 "stream them to disk"

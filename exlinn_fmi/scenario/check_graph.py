@@ -124,7 +124,7 @@ def misfit_starts(
             yield (*at, name), f"expected a number, found {'true' if value else 'false'}"
         elif text:
             continue
-        elif problem := value_problem(variable, float(value)):
+        elif problem := value_problem(variable, value):
             yield (*at, name), problem
 
 

@@ -221,7 +221,7 @@ def _no_form(place: Place) -> Finding:
     """A value that is none of the several forms that may stand there."""
     forms, value = alternatives(place.annotation), place.value
     if not all(is_model(form) for form in forms):
-        expected = either([_form_name(form) for form in forms])
+        expected = either(list(dict.fromkeys(map(_form_name, forms))))
         hint = _number_hint(expected, value)
         return place.path, f"expected {expected}, found {found(value)}{hint}"
     key = kind_field(forms[0])
@@ -252,7 +252,7 @@ def _form_name(annotation: Any) -> str:
     literals = _literals(annotation)
     if literals:
         return repr(literals[0])
-    origins = {float: "a number", bool: "true or false", str: "text"}
+    origins = {float: "a number", int: "a number", bool: "true or false", str: "text"}
     return origins.get(annotation) or ("a list" if "list" in str(annotation) else "a mapping")
 
 

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag
 
+from exlinn_fmi.components.base import Number
 from exlinn_fmi.components.texts import handle
 from exlinn_fmi.scenario.control import Nmpc
 from exlinn_fmi.scenario.events import Event
@@ -46,10 +47,17 @@ class ComponentBase(Spec):
         description="start values of parameters, inputs and states, by variable name; lists for arrays",
     )
 
-    def starts(self) -> dict[str, float]:
-        """Start values as components take them: arrays by element, texts by number."""
+    def starts(self) -> dict[str, Number]:
+        """Start values as components take them: arrays by element, texts by number, large numbers exactly."""
         flat = flat_starts(self.start)
-        return {name: handle(v) if isinstance(v, str) else float(v) for name, v in flat.items()}
+        return {
+            name: handle(v)
+            if isinstance(v, str)
+            else v
+            if isinstance(v, int) and abs(v) > 2**53
+            else float(v)
+            for name, v in flat.items()
+        }
 
 
 class FmuComponent(ComponentBase):

@@ -39,10 +39,10 @@ StartValue = Annotated[
     Annotated[float, Tag("a number")] | Annotated[bool, Tag("true or false")], Discriminator(form)
 ]
 Row = Annotated[
-    Annotated[float, Tag("a number")] | Annotated[list[float], Tag("a list")], Discriminator(form)
+    Annotated[int | float, Tag("a number")] | Annotated[list[int | float], Tag("a list")], Discriminator(form)
 ]
 AnyStart = Annotated[
-    Annotated[float, Tag("a number")]
+    Annotated[int | float, Tag("a number")]
     | Annotated[bool, Tag("true or false")]
     | Annotated[str, Tag("text")]
     | Annotated[list[Row], Tag("a list")],

@@ -9,13 +9,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from fmu_helpers import Driver
+from fmu_helpers import Driver, probe
+from hypothesis import given
+from hypothesis import strategies as st
 from reference_fmus import TYPES, feedthrough, reference, slave
 from test_reference_fmus import ball
 
 from exlinn_fmi.components.base import Status
 from exlinn_fmi.components.fmu import FmuComponent, FmuSettings, read_variables
 from exlinn_fmi.components.texts import handle, text
+from exlinn_fmi.components.wide import fits, joined, rest_of
 from exlinn_fmi.cosim.graph import Graph
 from exlinn_fmi.cosim.master import Master
 from exlinn_fmi.describe import describe
@@ -35,6 +38,12 @@ def opened() -> Iterator:
             return Driver(stack.enter_context(closing(component)))
 
         yield open_
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An FMU without Event Mode that passes whole numbers through."""
+    return probe(tmp_path_factory.mktemp("whole"), version=3)
 
 
 # ── all types ────────────────────────────────────────────────────────────────────────────────────────────
@@ -63,14 +72,85 @@ def test_elements_of_a_text_array_are_set_one_by_one(tmp_path: Path, opened) -> 
     assert [text(x) for x in driver.get("names_out[2]", "names_out[1]")] == ["second", "p"]
 
 
-def test_whole_numbers_beyond_what_float64_holds_are_rounded_with_a_warning(tmp_path: Path, opened) -> None:
-    driver = opened(feedthrough(tmp_path)).begin(h=0.1, stop=1.0)
-    driver.set(Int64_in=2.0**53 + 2)
-    values = np.zeros(1)
-    indices = np.array([driver.component.index("Int64_out")], dtype=np.intp)
-    assert driver.component.get(indices, values) == Status.WARNING
-    assert driver.component.message == "Int64_out is a whole number beyond 2^53 and was rounded"
-    assert values[0] == 2.0**53 + 2
+LARGE = {"Int64": (2**63 - 1, -(2**63), 2**53 + 1, -(2**62) - 3, 7), "UInt64": (2**64 - 1, 2**63 + 1, 7)}
+
+
+@pytest.mark.parametrize("algorithm", ["jacobi", "gauss-seidel"])
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize(("kind", "value"), [(kind, value) for kind in LARGE for value in LARGE[kind]])
+def test_whole_numbers_of_64_bits_are_given_connected_and_recorded_exactly(
+    tmp_path: Path, whole: Path, kind: str, value: int, compiled: bool, algorithm: str
+) -> None:
+    graph = Graph({name: FmuComponent(name, whole) for name in "ab"}, [(f"a.{kind}_out", f"b.{kind}_in")])
+    master = Master(graph, 0.0, 0.3, 0.1, compiled=compiled, algorithm=algorithm)
+    result = master.run({"a": {f"{kind}_in": value}})
+    assert result.error is None
+    assert result.statistics["stepping"] == ("compiled" if compiled else "plain")
+    for column in (f"a.{kind}_in", f"a.{kind}_out", f"b.{kind}_in", f"b.{kind}_out"):
+        assert result.frame[column].dtype == kind.lower()
+        assert result.frame[column].tolist() == [value] * 4
+
+
+def test_a_real_input_is_given_the_nearest_of_a_large_whole_number(tmp_path: Path, opened) -> None:
+    parts = {name: FmuComponent(name, feedthrough(tmp_path)) for name in "ab"}
+    result = Master(Graph(parts, [("a.Int64_out", "b.u[1]")]), 0.0, 0.1, 0.1).run(
+        {"a": {"Int64_in": 2**53 + 1}}
+    )
+    assert result.frame["b.u[1]"].tolist() == [2.0**53] * 2
+    assert result.frame["a.Int64_out"].tolist() == [2**53 + 1] * 2
+
+
+EXACT = """
+name: exact
+components:
+  a:
+    fmu: Probe.fmu
+    isolate: ISOLATE
+    start: {Int64_in: 9223372036854775807, UInt64_in: 18446744073709551615}
+  b: {fmu: Probe.fmu, isolate: ISOLATE}
+connections: {a.Int64_out: b.Int64_in, a.UInt64_out: b.UInt64_in}
+simulate: {stop: 0.4, step: 0.1, stream: STREAM}
+events:
+  - {on: b.UInt64_in, set: 5, at: 0.1, until: 0.2}
+  - {on: b.Int64_in, hold: true, at: 0.2}
+"""
+
+
+@pytest.mark.parametrize(("isolate", "stream"), [("false", "true"), ("true", "false")])
+def test_large_numbers_of_a_scenario_are_exact_in_its_files(
+    tmp_path: Path, whole: Path, isolate: str, stream: str
+) -> None:
+    (tmp_path / "Probe.fmu").write_bytes(whole.read_bytes())
+    file = tmp_path / "exact.yaml"
+    file.write_text(EXACT.replace("ISOLATE", isolate).replace("STREAM", stream))
+    work = Run.open(file, tmp_path / "run")
+    simulate(work)
+    most, bits = 2**63 - 1, 2**64 - 1
+    for table in (
+        pd.read_parquet(work.folder / "trajectories.parquet"),
+        pd.read_csv(work.folder / "trajectories.csv"),
+    ):
+        assert table["b.Int64_out"].tolist() == [most] * 5
+        assert table["b.UInt64_out"].tolist() == [bits, 5, bits, bits, bits]
+        assert table["b.UInt64_out"].dtype == np.uint64
+
+
+def test_a_number_beyond_its_type_is_told(tmp_path: Path, whole: Path) -> None:
+    (tmp_path / "Probe.fmu").write_bytes(whole.read_bytes())
+    file = tmp_path / "exact.yaml"
+    file.write_text(EXACT.replace("9223372036854775807", "9223372036854775808").replace("ISOLATE", "false"))
+    with pytest.raises(ScenarioError, match=r"start.Int64_in: expected -9.22337e\+18 … 9.22337e\+18"):
+        Run.open(file, tmp_path / "run")
+
+
+@given(st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**64 - 1))
+def test_a_whole_number_is_what_its_two_parts_make(signed: int, unsigned: int) -> None:
+    for kind, value in (("int64", signed), ("uint64", unsigned)):
+        number = np.array([value], dtype=kind)
+        nearest, rest = number.astype(float), rest_of(number)
+        assert fits(nearest, rest, kind).all()
+        assert joined(nearest, rest, kind).tolist() == [value]
+        assert rest[0] == value - int(nearest[0])
 
 
 def test_texts_are_connected(tmp_path: Path) -> None:
