@@ -305,21 +305,28 @@ def _cost_panel(table: Table, loop: Loop, rows: NDArray[np.bool_]) -> Panel | No
 
 
 def _solve_time_panel(table: Table, loop: Loop, rows: NDArray[np.bool_]) -> Panel | None:
-    """Time that each solve took, beside the sampling time that it must not exceed."""
-    column = loop.own("solve_time")
+    """Time that each solve took, and what of it was after the measurement, beside the sampling time."""
+    column, after = loop.own("solve_time"), loop.own("feedback_time")
     if column not in table.frame.columns or not rows.any():
         return None
     time, solve = _values(table.frame, "time")[rows], 1e3 * _values(table.frame, column)[rows]
     lines: tuple[Line, ...] = (Line("", time, solve, points=True),)
+    if after in table.frame.columns:
+        feedback = 1e3 * _values(table.frame, after)[rows]
+        lines = (
+            Line("in all", time, solve, points=True),
+            Line("after the measurement", time, feedback, "model", points=True),
+        )
     period, longest = 1e3 * loop.period, extremes(solve)[1]
-    if longest > period / 2:
+    near = longest > period / 2
+    if near:
         lines += (Line("bound", time[[0, -1]], np.full(2, period), "bound"),)
     return Panel(
         "solve time",
         "ms",
         lines,
         note=f"sampling time {period:g} ms",
-        limits=(0, 1.1 * max(longest, period if len(lines) > 1 else 0)) if longest > 0 else None,
+        limits=(0, 1.1 * max(longest, period if near else 0)) if longest > 0 else None,
     )
 
 

@@ -102,6 +102,12 @@ def test_within_the_set_the_feedback_keeps_all_bounds_and_the_set(seed, n, m):
     np.testing.assert_allclose(np.sum((after @ P) * after, axis=1), level - stage, atol=1e-8 * level)
 
 
+def test_what_is_no_riccati_solution_has_no_set():
+    A, B, R, P = np.eye(2), np.eye(2), np.eye(2), np.diag([1.0, -0.5])
+    none = np.zeros(0)
+    assert terminal_level(A, B, R, P, np.ones(2), none.astype(int), none) == 0.0
+
+
 def test_without_bounds_the_set_is_everywhere():
     assert targets(cart(), "x", 0.3)[1].level == EVERYWHERE
 

@@ -192,6 +192,14 @@ def test_a_one_sided_bound_is_said(tmp_path: Path) -> None:
     assert panels["alpha_dot"].note == ""
 
 
+def test_what_of_a_solve_is_after_the_measurement_is_shown_beside_all_of_it(tmp_path: Path) -> None:
+    frame = trajectories(stop=1)
+    frame["controller.feedback_time"] = 2e-4
+    panel = panels_of(make_run(tmp_path, control=True), frame)["solve time"]
+    assert [line.label for line in panel.lines] == ["in all", "after the measurement"]
+    assert panel.lines[1].y == pytest.approx(0.2)
+
+
 def test_slow_solves_are_set_against_the_sampling_time(tmp_path: Path) -> None:
     frame = trajectories(stop=1)
     frame["controller.solve_time"] *= 6
