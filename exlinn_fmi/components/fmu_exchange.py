@@ -140,9 +140,15 @@ class ModelExchange(Stepper):
             Refused: the FMU reports an error.
             Stopped: it asks to end, or it cannot be integrated.
         """
-        table, at = np.zeros((len(grid), len(outputs))), np.zeros(2, dtype=np.int64)
+        states = list(self._instance.description.states.references)
+        plain = len(states) == len(self.model.x) and set(outputs.tolist()) <= set(states)
+        at, columns = (
+            np.zeros(2, dtype=np.int64),
+            [states.index(r) for r in outputs] if plain else slice(None),
+        )
+        table = np.zeros((len(grid), len(states) if plain else len(outputs)))
         self.model.vary(references, values[0], np.zeros(len(references)))
-        self.model.sample(outputs)
+        self.model.sample(None if plain else outputs)  # to ask the FMU for its states would take longer
         while True:
             until = self._events.next_event
             code = compiled.follow(*self.model.arrays, until, knots, values, grid, table, at)
@@ -154,7 +160,7 @@ class ModelExchange(Stepper):
             if code != compiled.REACHED or due:
                 self._event()
             elif at[0] == len(knots) - 1:
-                return table
+                return table[:, columns]
 
     def _meet_stiffness(self) -> None:
         """Go on with another solver, or not mind."""

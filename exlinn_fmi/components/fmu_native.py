@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from ctypes import byref, c_bool, c_int, c_size_t, c_uint32, c_void_p
+from ctypes import byref, c_bool, c_int, c_size_t, c_void_p
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -433,7 +433,7 @@ def value_buffer(description: FmuDescription, accessor: str, size: int) -> np.nd
 
 def reference_buffer(references: list[int]) -> np.ndarray[Any, Any]:
     """Value references as the C functions want them."""
-    return np.array(references, dtype=c_uint32)
+    return np.array(references, dtype=np.uint32)
 
 
 @contextmanager

@@ -28,8 +28,8 @@ FAILED = 100
 INSTANCE, SET_TIME, SET_STATES, GET_DERIVATIVES, GET_INDICATORS, COMPLETED = range(6)
 SET_INPUTS, GET_OUTPUTS, VERSION, KEEP, INPUTS, OUTPUTS, FLAGS, WARNED = range(6, 14)
 """Places in `calls`: the instance, addresses of functions, FMI version, whether states are saved, addresses
-of the value references of inputs that vary and of outputs that are sampled, room for two flags, and a bit for
-each function that has returned a warning, by its place."""
+of the value references of inputs that vary and of outputs that are sampled (0 where the states are), room for
+two flags, and a bit for each function that has returned a warning, by its place."""
 
 T, H, STEPS, REJECTED, STIFFNESS, T_INPUT, RTOL = range(7)
 """Places in `clock`: time, next step, counters, steps that looked stiff, time of inputs, tolerance."""
@@ -92,9 +92,10 @@ class Model:
         self.inputs, self.u = inputs, np.stack([values, rates, np.zeros_like(values)])
         self.calls[INPUTS], self.clock[T_INPUT] = inputs.ctypes.data, self.clock[T]
 
-    def sample(self, outputs: NDArray[np.uint32]) -> None:
-        """Sample outputs (p,)."""
-        self.outputs, self.calls[OUTPUTS] = outputs, outputs.ctypes.data
+    def sample(self, outputs: NDArray[np.uint32] | None) -> None:
+        """Sample outputs (p,), or the states."""
+        self.outputs = np.zeros(0, dtype=np.uint32) if outputs is None else outputs
+        self.calls[OUTPUTS] = 0 if outputs is None else outputs.ctypes.data
 
     @property
     def arrays(self) -> tuple[Any, ...]:
@@ -341,10 +342,15 @@ def locate(calls: Any, clock: Any, w: Any, z: Any, u: Any, h: float) -> Any:
 def sample(
     calls: Any, clock: Any, w: Any, u: Any, h: float, share: float, grid: Any, table: Any, row: int
 ) -> Any:
-    """Outputs at the times of the grid up to t + share · h into the table; the next row, and 0 or a code."""
+    """Outputs or states at times up to t + share · h into the table; the next row, and 0 or a code."""
     t, p = clock[T], table.shape[1]
     while row < len(grid) and grid[row] <= t + share * h:
         dense(w, (grid[row] - t) / h)
+        if not calls[OUTPUTS]:
+            for i in range(p):
+                table[row, i] = w[AT, i]
+            row += 1
+            continue
         code = apply(calls, clock, w, u, grid[row], AT)
         if code:
             return row, code

@@ -201,6 +201,8 @@ def groups(
 ) -> list[Group]:
     """The C calls that get or set those of the variables at `indices` whose positions are `chosen`."""
     made: list[Group] = []
+    if not chosen.size:
+        return made
     for (accessor, reference), places in by_call(description, indices[chosen]).items():
         where = chosen[places]
         positions: Any = slice(None) if len(where) == len(indices) else where

@@ -57,6 +57,8 @@ def test_a_trajectory_bounces(tmp_path: Path, version: int) -> None:
     with closing(FmuComponent("ball", reference(tmp_path, "BouncingBall", version), settings)) as component:
         times = np.linspace(0, 3, 301)
         found = trajectory(component, times, ("h", "v"))
+        asked = trajectory(component, times, ("v", "der(v)", "h"))  # the FMU itself, not for states alone
+    assert (found == asked[:, [2, 0]]).all()
     np.testing.assert_allclose(found, [ball(t) for t in times], rtol=0, atol=1e-7)
 
 
