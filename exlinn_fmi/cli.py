@@ -31,13 +31,22 @@ app = typer.Typer(
 )
 
 ScenarioFile = Annotated[
-    Path, typer.Argument(help="Scenario file (YAML), or a system of SSP.", metavar="SCENARIO")
+    Path,
+    typer.Argument(
+        help="Scenario file (YAML), an FMU to run by itself, or a system of SSP.", metavar="SCENARIO"
+    ),
 ]
 Out = Annotated[Path | None, typer.Option("--out", help="Run folder; runs/<scenario name> if not given.")]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY.PATH=VALUE", help="Set a value of the scenario; may be given often."),
+    typer.Option(
+        "--set",
+        metavar="KEY.PATH=VALUE",
+        help="Set a value of the scenario, or with component.variable a start value; may be given often.",
+    ),
 ]
+Stop = Annotated[float | None, typer.Option("--stop", help="Stop time of the co-simulation [s].")]
+Step = Annotated[float | None, typer.Option("--step", help="Communication step [s].")]
 
 Resume = Annotated[
     bool, typer.Option("--resume", help="Go on from the last checkpoint of a co-simulation that was stopped.")
@@ -109,20 +118,46 @@ def run(
     scenario: ScenarioFile,
     out: Out = None,
     overrides: Overrides = None,
+    stop: Stop = None,
+    step: Step = None,
     record: Record = None,
     resume: Resume = False,
 ) -> None:
     """Do all that a scenario asks for: collect, train, simulate, report.
 
-    Example: exlinn run scenarios/dcwc_tracking.yaml --set simulate.stop=5
+    Example: exlinn run scenarios/dcwc_tracking.yaml --stop 5
+
+    An FMU is simulated by itself: exlinn run fmus/DCMotorCart.fmu --set plant.v=12 --stop 3
     """
     from exlinn_fmi import pipeline
 
     began = time.perf_counter()
-    overrides = [*(overrides or ()), *recording(record)]
+    overrides = [*(overrides or ()), *shorthand(stop, step, record)]
     work = perform(lambda work: pipeline.run(work, resume), scenario, out, overrides)
     show_metrics(work.folder)
     typer.echo(f"\n{work.folder / 'report.html'}  ({time.perf_counter() - began:.1f} s)")
+
+
+@app.command()
+def init(
+    files: Annotated[
+        list[Path], typer.Argument(help="An FMU, or recordings (CSV, Parquet).", metavar="FILE...")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Scenario to write; <name of the file>.yaml here if not given."),
+    ] = None,
+) -> None:
+    """Write a scenario to go on with, for an FMU or for measured data.
+
+    Inputs, parameters and units are filled in, and what names and units tell of generalised coordinates. TODO
+    marks what is yours to look at; the file can be run as it is, unless nothing could be told.
+
+    Example: exlinn init fmus/DCMotorCart.fmu --out motor.yaml
+    """
+    from exlinn_fmi.drafting import draft
+
+    typer.echo(draft(files, out))
 
 
 @app.command()
@@ -198,19 +233,23 @@ def simulate(
     scenario: ScenarioFile,
     out: Out = None,
     overrides: Overrides = None,
+    stop: Stop = None,
+    step: Step = None,
     record: Record = None,
     resume: Resume = False,
 ) -> None:
     """Run the scenario's components in co-simulation (learning first what they need).
 
-    Example: exlinn simulate scenarios/external_fmu.yaml --set components.fmu.fmu=/path/to/Plant.fmu
+    Example: exlinn simulate scenarios/two_fmus.yaml --stop 2 --record 'first.*'
+
+    An FMU by itself: exlinn simulate fmus/DCMotorCart.fmu --set plant.v=12 --stop 3 --step 1e-3
 
     A long run that may be interrupted: --set simulate.checkpoint=60 makes a checkpoint each minute, and the
     same command with --resume goes on from the last one.
     """
     from exlinn_fmi import pipeline
 
-    overrides = [*(overrides or ()), *recording(record)]
+    overrides = [*(overrides or ()), *shorthand(stop, step, record)]
     work = perform(lambda work: pipeline.simulate(work, resume), scenario, out, overrides)
     show_metrics(work.folder, "control.", "simulate.")
     typer.echo(f"\n{work.folder / 'trajectories.csv'}")
@@ -278,18 +317,20 @@ def schema(
         typer.echo(str(out))
 
 
-def recording(patterns: list[str] | None) -> list[str]:
-    """The setting of the scenario that stands for `--record`."""
+def shorthand(stop: float | None, step: float | None, record: list[str] | None) -> list[str]:
+    """The settings of the scenario that `--stop`, `--step` and `--record` stand for."""
     import json
 
-    return [f"simulate.record={json.dumps(patterns)}"] if patterns else []
+    given = {"stop": stop, "step": step, "record": record or None}
+    return [f"simulate.{key}={json.dumps(value)}" for key, value in given.items() if value is not None]
 
 
 def show_metrics(folder: Path, *prefixes: str) -> None:
-    """Print the metrics of a run folder, one a line."""
+    """Print the metrics of a run folder that have a value, one a line."""
     from exlinn_fmi.workspace import metrics
 
-    values = {k: v for k, v in metrics(folder).items() if k.startswith(prefixes or ("",))}
+    known = {k: v for k, v in metrics(folder).items() if v is not None or k.startswith("learn.rollout")}
+    values = {k: v for k, v in known.items() if k.startswith(prefixes or ("",))}
     width = max(map(len, values), default=0)
     for name, value in values.items():
         typer.echo(

@@ -105,7 +105,11 @@ class Run:
             InputError: it has none.
         """
         if self.scenario.learn is None:
-            raise InputError(f"{self.loaded.file}: this needs a `learn` section, and the scenario has none")
+            file = self.loaded.file
+            hint = (
+                f"; `exlinn init {file}` writes a scenario with one" if file.suffix.lower() == ".fmu" else ""
+            )
+            raise InputError(f"{file}: this needs a `learn` section, and the scenario has none{hint}")
         return self.scenario.learn
 
     @property

@@ -163,7 +163,7 @@ class FmuComponent(Component):
             return self.settings.tolerance
         from exlinn_fmi.components.fmu_exchange import TOLERANCE
 
-        return self.description.tolerance or TOLERANCE
+        return self.description.experiment.tolerance or TOLERANCE
 
     def _make_stepper(self) -> Stepper:
         interface = self.description.interface

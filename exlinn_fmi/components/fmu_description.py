@@ -82,6 +82,23 @@ class StateNames:
 
 
 @dataclass(frozen=True)
+class DefaultExperiment:
+    """The run that an FMU proposes, as far as it does.
+
+    Args:
+        start: start time [s].
+        stop: stop time [s], None where it states none.
+        step: step [s], None where it states none.
+        tolerance: relative tolerance, None where it states none.
+    """
+
+    start: float = 0.0
+    stop: float | None = None
+    step: float | None = None
+    tolerance: float | None = None
+
+
+@dataclass(frozen=True)
 class FmuDescription:
     """What an FMU says of itself, as far as a master needs it, for one way of using it.
 
@@ -104,7 +121,7 @@ class FmuDescription:
         state_count: number of continuous states; FMI 3 FMUs are asked for it.
         indicator_count: number of event indicators; FMI 3 FMUs are asked for it.
         clocks: its clocks.
-        tolerance: relative tolerance of its default experiment, None where it states none.
+        experiment: the run that it proposes.
         log_categories: names of the log categories that it has.
     """
 
@@ -126,7 +143,7 @@ class FmuDescription:
     state_count: int = 0
     indicator_count: int = 0
     clocks: tuple[Clock, ...] = ()
-    tolerance: float | None = None
+    experiment: DefaultExperiment = DefaultExperiment()
     log_categories: tuple[str, ...] = ()
 
     @property
@@ -178,7 +195,6 @@ def describe(
         zip(*_with_dependencies(version, model, parts), strict=True) if parts else ([],) * 4
     )
     states, rates = _states(version, model)
-    default = model.defaultExperiment
     return FmuDescription(
         path=path,
         version=version,
@@ -202,7 +218,7 @@ def describe(
         state_count=model.numberOfContinuousStates,
         indicator_count=model.numberOfEventIndicators,
         clocks=tuple(_clocks(root)),
-        tolerance=float(default.tolerance) if default is not None and default.tolerance else None,
+        experiment=_experiment(model.defaultExperiment),
         log_categories=tuple(category.name for category in model.logCategories),
     )
 
@@ -368,6 +384,23 @@ def _number(text: str | int | None) -> Number | None:
         return float(text == "true")
     number = float(text)
     return int(text) if abs(number) > 2**53 and str(text).lstrip("+-").isdecimal() else number
+
+
+def _experiment(stated: Any) -> DefaultExperiment:
+    """The default experiment; numbers that make no sense count as not stated."""
+    if stated is None:
+        return DefaultExperiment()
+    start, stop, step, tolerance = (
+        _number(getattr(stated, key, None) or None)
+        for key in ("startTime", "stopTime", "stepSize", "tolerance")
+    )
+    start = start or 0.0
+    return DefaultExperiment(
+        start,
+        stop if stop is not None and start < stop < math.inf else None,
+        step if step is not None and 0 < step < math.inf else None,
+        tolerance or None,
+    )
 
 
 # ── clocks ───────────────────────────────────────────────────────────────────────────────────────────────

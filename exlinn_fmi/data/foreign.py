@@ -26,6 +26,8 @@ DELIMITERS = (";", "\t", ",", "|", " ")
 HEAD = 100
 """Lines in which column names are looked for, and from which a dialect is found out."""
 PARQUET = (".parquet", ".pq")
+SUFFIXES = ("deg", "rad", "rpm", "mm", "ms", "mA", "mV", "Nm", "V", "A", "N", "m", "s")
+"""Units that stand behind names without brackets."""
 SHOWN = 4
 """Most mistakes of one file that a message spells out."""
 
@@ -132,6 +134,29 @@ def column_names(
         except (OSError, pa.ArrowException) as error:
             raise DataError(f"{path.name}: cannot be read as Parquet ({_line(error)})") from error
     return _dialect(path, _text(path, head=True), list(wanted), delimiter, decimal).names
+
+
+def columns_with_units(path: Path) -> dict[str, str]:
+    """Names of the columns of a CSV or Parquet file, and their units as far as the file tells.
+
+    A unit stands behind the name, ``u [V]``, ``n_rpm``, or in a line of units below the names.
+
+    Raises:
+        DataError: it is not there, or is no table.
+    """
+    if path.suffix.lower() in PARQUET:
+        return {name: _unit(name) for name in column_names(path)}
+    dialect = _dialect(path, _text(path, head=True), (), None, None)
+    below = dict(zip(dialect.names, dialect.units, strict=False))
+    return {name: below.get(name, "").strip("[]()") or _unit(name) for name in dialect.names}
+
+
+def _unit(name: str) -> str:
+    """The unit behind a column's name, empty where there is none."""
+    behind = re.search(r"[\[(]\s*([^\W\d][^\])]*)[\])]\s*$", name) or re.search(
+        rf"_({'|'.join(SUFFIXES)})$", name
+    )
+    return behind[1].strip() if behind else ""
 
 
 def _check_names(path: Path, wanted: Sequence[str], known: Sequence[str]) -> None:

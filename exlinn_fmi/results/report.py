@@ -59,11 +59,11 @@ def render(run: RunFiles) -> str:
 
     drawn = charts(run)
     sections = {
-        "metrics": ("Metrics", _metrics(run)),
-        "learning": ("Learning", _charts(drawn, "learning") + _parameters(run.parameters)),
+        "learning": ("Learning", _parameters(run.parameters) + _charts(drawn, "learning")),
         "control": ("Closed loop", _charts(drawn, "control")),
         "study": ("Robustness", _charts(drawn, "study") + _worst(run)),
         "trajectories": ("Trajectories", _charts(drawn, "trajectories")),
+        "metrics": ("Metrics", _metrics(run)),
         "run": ("Run", _stages(run.provenance)),
         "provenance": ("Provenance", _provenance(run.provenance)),
         "scenario": ("Scenario", f"<pre>{escape(run.scenario_text)}</pre>"),

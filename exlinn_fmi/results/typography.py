@@ -25,11 +25,14 @@ def readable(size: float, unit: str) -> tuple[float, str]:
     """A factor that brings values up to `size` between 1 and 1000, and the unit they then have."""
     if not 0 < size < np.inf:
         return 1.0, unit
+    if unit == "ms":
+        factor, unit = readable(1e-3 * size, "s")
+        return 1e-3 * factor, unit
     exponent = int(np.clip(3 * np.floor(np.log10(size) / 3), -15, 6))
     if exponent == 0:
         return 1.0, unit
     head = unit.partition("/")[0].partition(".")[0]
-    if head.isalpha() and head not in ("kg", "ms"):
+    if head.isalpha() and head != "kg":
         return 10.0**-exponent, PREFIXES[exponent] + unit
     power = "10" + str(exponent).translate(SUPERSCRIPTS)
     return 10.0**-exponent, f"{power} {unit}".strip()

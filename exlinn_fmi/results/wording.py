@@ -49,7 +49,7 @@ WORDING = (
     (r"control\.deadline_misses", "Solves that took longer than the sampling time", ""),
     (r"control\.missing_measurements", "Measurements that were missing, and were predicted", ""),
     (r"control\.lost_samples", "Samples with the safe input, as measurements were missing for too long", ""),
-    (r"control\.decrease", "Samples at which the cost fell as a Lyapunov function must", ""),
+    (r"control\.decrease", "Share of samples at which the cost fell as a Lyapunov function must", ""),
     (r"control\.terminal_inside", "Samples whose plan ended in the terminal set", ""),
     (r"control\.fallbacks", "Steps that fell back to the previous plan", ""),
     (r"control\.iterations_mean", "Solver iterations a step, mean", ""),
@@ -61,7 +61,7 @@ WORDING = (
     (r"study\.success_rate_high", "… at most (95 %)", ""),
     (r"study\.failed", "Runs that ended with an error", ""),
     (r"study\.runs_with_(.+)", "Runs with {0}", ""),
-    (r"study\.decrease_p50", "Samples at which the cost fell as it must, median of the runs", ""),
+    (r"study\.decrease_p50", "Share of samples at which the cost fell as it must, median of the runs", ""),
     (r"study\.decrease_min", "… in the worst run", ""),
     (r"study\.(rmse|max_error)_(.+)_p(\d+)", "{0} of {1}, {2} % of the runs stay below", ""),
     (r"study\.(rmse|max_error)_(.+)_max", "{0} of {1}, worst run", ""),
@@ -137,7 +137,7 @@ def value(run: RunFiles, key: str) -> str:
         diverged = key.startswith("learn.rollout") and run.metrics.get("learn.rollout_diverged")
         return "diverged" if diverged else NO_VALUE
     if isinstance(metric, str):
-        return escape(metric)
+        return f'<span class="words">{escape(metric)}</span>'
     factor, multiple = readable(abs(metric), unit) if unit else (1.0, "")
     shown = f"{number(metric * factor, 3)} {typeset(multiple)}".strip()
     return f'<span title="{escape(f"{metric!r} {unit}".strip())}">{escape(shown)}</span>'

@@ -25,6 +25,7 @@ from exlinn_fmi.scenario.editor import json_schema
 from exlinn_fmi.scenario.explain import Finding, schema_findings
 from exlinn_fmi.scenario.learning import Measured
 from exlinn_fmi.scenario.overrides import apply
+from exlinn_fmi.scenario.places import unfilled
 from exlinn_fmi.scenario.schema import (
     FmuComponent,
     ModelComponent,
@@ -39,6 +40,8 @@ from exlinn_fmi.scenario.words import KeyPath, key_path, missing_file
 
 __all__ = ["Inspect", "LoadedScenario", "json_schema", "load_scenario", "named_files"]
 
+TABLES = (".csv", ".tsv", ".parquet", ".pq")
+"""Suffixes of files that hold data."""
 CHECKS = (
     check_graph.components,
     check_graph.trusted,
@@ -87,7 +90,7 @@ def load_scenario(
     """Read a scenario file and check it.
 
     Args:
-        path: the file, YAML 1.2.
+        path: the file, YAML 1.2; or an FMU, which is run by itself, or a system of SSP.
         overrides: ``key.path=value`` each, e.g. ``simulate.stop=5`` or ``learn.training[0].duration=2``.
         inspect: finds the variables of a component without running it, for the checks of their use.
 
@@ -95,10 +98,10 @@ def load_scenario(
         ScenarioError: with every mistake in the file and the overrides.
     """
     file = Path(path)
-    is_ssp = file.suffix.lower() in SUFFIXES
-    text, folder = _translated(file, inspect) if is_ssp else (_read(file), file.parent)
+    foreign = file.suffix.lower() in (*SUFFIXES, ".fmu", *TABLES)
+    text, folder = _translated(file, inspect) if foreign else (_read(file), file.parent)
     document = parse(text)
-    if is_ssp:
+    if foreign:
         document = replace(document, lines={})  # there are none in the file
     problems = list(document.problems)
     if document.data is None and not problems:
@@ -113,11 +116,13 @@ def load_scenario(
         # Lines of this text are not those of the file.
         problems += [Problem(p.path, f"{p.message} (after the overrides)") for p in overridden.problems]
     if data is not None:
-        findings = schema_findings(data, document.faulty)
-        known, more = survey(data, folder, inspect)
-        findings += more
-        for check in CHECKS:
-            findings += check(known)
+        findings = list(unfilled(data)) if isinstance(data, dict) else []
+        findings += schema_findings(data, document.faulty.union(at for at, _ in findings))
+        if not any(text.startswith("still TODO") for _, text in findings):
+            known, more = survey(data, folder, inspect)
+            findings += more
+            for check in CHECKS:
+                findings += check(known)
         problems += [_problem(finding, document, applied) for finding in dict.fromkeys(findings)]
     if problems:
         raise ScenarioError(str(file), list(dict.fromkeys(problems)))
@@ -126,13 +131,21 @@ def load_scenario(
 
 
 def _translated(file: Path, inspect: Inspect | None) -> tuple[str, Path]:
-    """The scenario that a system structure (SSP) stands for, and the folder of its files.
+    """The scenario that an FMU or a system structure (SSP) stands for, and the folder of its files.
 
     Raises:
         ScenarioError: the file cannot be used.
     """
     if not file.is_file():
         raise ScenarioError(str(file), [Problem("", missing_file(file.name, file.parent))])
+    if file.suffix.lower() in TABLES:
+        hint = f"a table of data, no scenario; `exlinn init {file}` writes one that learns from it"
+        raise ScenarioError(str(file), [Problem("", hint)])
+    if file.suffix.lower() == ".fmu":
+        from exlinn_fmi.components.fmu_file import read_description
+        from exlinn_fmi.scenario.draft import lone_fmu
+
+        return lone_fmu(read_description(file)), file.parent
 
     def look(fmu: Path) -> Sequence[Variable]:
         return inspect(FmuComponent(fmu=str(fmu)), Path()) if inspect is not None else ()

@@ -37,6 +37,7 @@ def apply(text: str, overrides: Sequence[str]) -> tuple[str, dict[KeyPath, str],
     Args:
         text: valid YAML with a mapping at the top.
         overrides: ``key.path=value`` each, the value being YAML; list indices as ``[0]`` or ``.0``.
+            ``component.variable=value`` stands for a start value.
 
     Returns:
         The new text, the override at each key path that was set, and a problem for each that does not fit.
@@ -48,7 +49,7 @@ def apply(text: str, overrides: Sequence[str]) -> tuple[str, dict[KeyPath, str],
         try:
             if not equals or not name.strip():
                 raise _UnfitError(f"an override reads key.path=value, found {override!r}")
-            applied[_set(document, _keys(name.strip()), _value(value))] = override
+            applied[_set(document, _keys(name.strip(), document), _value(value))] = override
         except _UnfitError as unfit:
             problems.append(Problem(name.strip() if equals else "", f"{unfit} (override {override!r})"))
     if not applied:
@@ -58,9 +59,16 @@ def apply(text: str, overrides: Sequence[str]) -> tuple[str, dict[KeyPath, str],
     return stream.getvalue(), applied, problems
 
 
-def _keys(name: str) -> list[str]:
-    """The parts of a key path: ``a[0].b`` and ``a.0.b`` give a, 0, b."""
-    return [part for part in re.sub(r"\[(\d+)\]", r".\1.", name).split(".") if part]
+def _keys(name: str, document: Any) -> list[str]:
+    """The parts of a key path: ``a[0].b`` gives a, [0], b; a component's variable is its start value."""
+    keys = [part for part in re.sub(r"(\[\d+\])", r".\1.", name).split(".") if part]
+    short = keys[0] not in Scenario.model_fields and keys[0] in (document.get("components") or {})
+    return ["components", keys[0], "start", *keys[1:]] if short and len(keys) > 1 else keys
+
+
+def _joined(keys: list[str]) -> str:
+    """Parts of a key path as one key."""
+    return "".join(key if key.startswith("[") else f".{key}" for key in keys).removeprefix(".")
 
 
 def _value(text: str) -> Any:
@@ -94,15 +102,14 @@ def _next(at: Any, annotation: Any, keys: list[str], path: list[Any], value: Any
     """The key to go on with, and the parts of the path that then are left."""
     where = f"{key_path(path)!r}" if path else "the scenario"
     if isinstance(at, list):
-        if not keys[0].isdigit() or int(keys[0]) >= len(at):
-            raise _UnfitError(
-                f"{where} is a list of {len(at)}, counted from 0: there is no {keys[0]!r} in it"
-            )
-        return int(keys[0]), keys[1:]
+        index = keys[0].strip("[]")
+        if not index.isdigit() or int(index) >= len(at):
+            raise _UnfitError(f"{where} is a list of {len(at)}, counted from 0: there is no {index!r} in it")
+        return int(index), keys[1:]
     if not isinstance(at, dict):
         raise _UnfitError(f"{where} is no section: there is nothing under it")
     for length in range(len(keys), 0, -1):  # keys may hold dots, as those of `connections` do
-        if (known := ".".join(keys[:length])) in at:
+        if (known := _joined(keys[:length])) in at:
             return known, keys[length:]
     chosen = choose(annotation, at)
     if is_model(chosen):
@@ -114,7 +121,7 @@ def _next(at: Any, annotation: Any, keys: list[str], path: list[Any], value: Any
         near = [k for k in at if len(k.split(".")) <= len(keys)]
         given = ".".join(keys[: max((len(k.split(".")) for k in near), default=1)])
         raise _UnfitError(f"no {given!r} in {where}{suggestion(given, near, 'there are')}")
-    return ".".join(keys), []
+    return _joined(keys), []
 
 
 def _sections(annotation: Any) -> bool:

@@ -5,7 +5,7 @@ Error texts and overrides ask this; the answer comes from the annotations of the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeGuard, Union, get_args, get_origin
@@ -108,6 +108,20 @@ class Place:
     model: type[Spec] | None = None
     siblings: Any = None
     is_key: bool = False
+
+
+def unfilled(value: Any, annotation: Any = Scenario, path: KeyPath = ()) -> Iterator[tuple[KeyPath, str]]:
+    """Places where a draft of `exlinn init` still says TODO, each with what is wanted there."""
+    members = value.items() if isinstance(value, Mapping) else enumerate(value)
+    chosen = choose(annotation, value)
+    for key, member in members:
+        here = (*path, key)
+        if "TODO" in (key, member):
+            field = chosen.model_fields.get(str(key)) if is_model(chosen) else None
+            wanted = f": {field.description}" if field is not None and field.description else ""
+            yield here, f"still TODO{wanted}"
+        elif isinstance(member, Mapping | list):
+            yield from unfilled(member, below(annotation, key, value), here)
 
 
 def locate(location: Sequence[str | int], data: Any) -> Place:

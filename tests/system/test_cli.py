@@ -69,7 +69,8 @@ def test_public_names_are_sorted_and_there() -> None:
 
 
 @pytest.mark.parametrize(
-    "verb", ["run", "validate", "info", "collect", "train", "simulate", "report", "schema", "export plant"]
+    "verb",
+    ["run", "init", "validate", "info", "collect", "train", "simulate", "report", "schema", "export plant"],
 )
 def test_help_of_every_verb_has_an_example(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code([*verb.split(), "--help"]) == 0

@@ -116,7 +116,7 @@ def test_the_report_is_below_ten_megabytes(whole: Path) -> None:
 
 def test_every_link_has_its_anchor(whole_page: Page) -> None:
     links = [str(a["href"]).removeprefix("#") for t, a in whole_page.tags if t == "a"]
-    assert links == ["metrics", "learning", "control", "run", "provenance", "scenario"]
+    assert links == ["learning", "control", "metrics", "run", "provenance", "scenario"]
     assert set(links) <= set(whole_page.ids)
 
 

@@ -30,6 +30,8 @@ def test_comments_and_all_else_stay_as_written(tmp_path):
     ("override", "keys", "value"),
     [
         ("seed=4", ("seed",), 4),
+        ("plant.mass.m=2", ("components", "plant", "start", "mass.m"), 2),
+        ("plant.x[1]=3", ("components", "plant", "start", "x[1]"), 3),
         ("description='a: b'", ("description",), "a: b"),
         ("learn.training[1].duration=2", ("learn", "training", 1, "duration"), 2),
         ("learn.training.0.duration=3", ("learn", "training", 0, "duration"), 3),
