@@ -48,8 +48,8 @@ def span(experiment: DefaultExperiment) -> tuple[float, float]:
 
 def _record(fmu: FmuDescription) -> str:
     """What is recorded: inputs and outputs, or all if it has no outputs."""
-    inside_only = fmu.variables and all(v.causality != "output" for v in fmu.variables)
-    return f', record: ["{PLANT}.*"]' if inside_only else ""
+    kinds = {v.causality for v in fmu.variables}
+    return f', record: ["{PLANT}.*"]' if "local" in kinds and "output" not in kinds else ""
 
 
 # ── an FMU ───────────────────────────────────────────────────────────────────────────────────────────────
