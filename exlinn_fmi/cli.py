@@ -22,8 +22,6 @@ UsageError: Any = next(base for base in typer.BadParameter.__mro__ if base.__nam
 
 app = typer.Typer(
     name="exlinn",
-    help="Learn a physics-faithful model of a plant, control it with NMPC, run both in co-simulation.\n\n"
-    "Example: exlinn run scenarios/dcwc_tracking.yaml",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -111,6 +109,27 @@ def perform(work: Callable[[Run], object], file: Path, out: Path | None, overrid
     finally:
         terminal.close()
     return run
+
+
+def show_version(wanted: bool) -> None:
+    """Print the version and end, where that is asked for."""
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"exlinn {version('exlinn-fmi')}")
+        raise typer.Exit
+
+
+@app.callback()
+def exlinn(
+    version: Annotated[
+        bool, typer.Option("--version", callback=show_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Learn a physics-faithful model of a plant, control it with NMPC, run both in co-simulation.
+
+    Example: exlinn run scenarios/dcwc_tracking.yaml
+    """
 
 
 @app.command()

@@ -14,6 +14,9 @@ from exlinn_fmi.errors import InputError
 if TYPE_CHECKING:
     from exlinn_fmi.workspace import Run
 
+ORDER = ("independent", "input", "output", "parameter", "local")
+"""Causalities as variables are listed."""
+
 
 def describe(target: Path, overrides: Sequence[str] = ()) -> str:
     """Describe a file or folder by what it is.
@@ -58,7 +61,7 @@ def describe_fmu(file: Path) -> str:
 def describe_variables(variables: Iterable[Variable]) -> str:
     """Variables as a table: causality, name, unit, type, start, direct feed-through, description."""
     rows = [("causality", "name", "unit", "type", "start", "depends on", "")]
-    for v in variables:
+    for v in sorted(variables, key=lambda v: ORDER.index(v.causality)):
         through = "" if v.causality != "output" else "?" if v.depends_on is None else " ".join(v.depends_on)
         start = "" if v.start is None else f"{v.start:.9g}"
         if v.start is not None and v.type in TEXT_TYPES:

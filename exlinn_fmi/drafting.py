@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -35,7 +36,8 @@ def draft(files: Sequence[Path], out: Path | None = None) -> str:
     text = _fmu(files[0], names[0], target) if kinds == {FMU} else _tables(files[0], names, target)
     write_text(target, text)
     todo = sum("TODO" in line for line in text.splitlines())
-    return f"{target}  ({todo} places to look at, marked TODO)\n\nnext: exlinn validate {target}"
+    following = f"next: exlinn validate {shlex.quote(str(target))}"
+    return f"{target}  ({todo} places to look at, marked TODO)\n\n{following}"
 
 
 def _checked(file: Path) -> bool:
@@ -57,11 +59,11 @@ def _fmu(file: Path, name: str, target: Path) -> str:
 
     description = read_description(file)
     check_runnable(description)
-    return fmu_draft(description, name, target.as_posix())
+    return fmu_draft(description, name, shlex.quote(target.as_posix()))
 
 
 def _tables(first: Path, names: Sequence[str], target: Path) -> str:
     from exlinn_fmi.data.foreign import columns_with_units
     from exlinn_fmi.scenario.draft_data import data_draft
 
-    return data_draft(names, columns_with_units(first), target.as_posix())
+    return data_draft(names, columns_with_units(first), shlex.quote(target.as_posix()))

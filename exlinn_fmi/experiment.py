@@ -87,6 +87,7 @@ def experiment(work: Run, learn: LearnFromPlant) -> Dataset:
     """
     from exlinn_fmi.data.dataset import Dataset
     from exlinn_fmi.data.doubts import audit
+    from exlinn_fmi.data.integration import euler_steps
     from exlinn_fmi.errors import DataError
 
     runs: list[Trajectories] = []
@@ -103,7 +104,7 @@ def experiment(work: Run, learn: LearnFromPlant) -> Dataset:
         dataset = replace(
             Dataset.from_columns(columns, coordinates, units(learn, runs[0])), held_out=held_out
         )
-        return replace(dataset, notes=tuple(audit(dataset, names)))
+        return replace(dataset, notes=(*audit(dataset, names), *euler_steps(dataset)))
     except DataError:
         write_table(work.folder / "dataset", table(learn, runs), units(learn, runs[0]))
         raise

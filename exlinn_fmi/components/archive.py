@@ -163,7 +163,12 @@ def _check_members(path: Path, members: Sequence[zipfile.ZipInfo]) -> None:
     for info in members:
         name = info.filename
         parts = PurePosixPath(name)
-        if parts.is_absolute() or ".." in parts.parts or "\\" in name or ":" in name:
+        if "\\" in name:
+            raise FmuError(
+                f"{path}: the archive holds {name!r}, and names in archives take '/': zip it again, or "
+                "export it with a newer version of its tool"
+            )
+        if parts.is_absolute() or ".." in parts.parts or ":" in name:
             raise FmuError(f"{path}: the archive holds {name!r}, which would be written outside its folder")
         if not name.isprintable():
             raise FmuError(f"{path}: the archive holds {name!r}, which is no file name")

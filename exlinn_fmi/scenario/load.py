@@ -178,6 +178,9 @@ def _read(file: Path) -> str:
     except UnicodeDecodeError as error:
         line = error.object.count(b"\n", 0, error.start) + 1
         raise ScenarioError(str(file), [Problem("", "not UTF-8 text; save it as UTF-8", line)]) from None
+    except IsADirectoryError:
+        message = "is a folder; give a scenario (YAML), an FMU or a system of SSP"
+        raise ScenarioError(str(file), [Problem("", message)]) from None
     except OSError as error:
         raise ScenarioError(str(file), [Problem("", f"cannot be read: {error.strerror}")]) from None
 

@@ -115,6 +115,7 @@ def _next(at: Any, annotation: Any, keys: list[str], path: list[Any], value: Any
     if is_model(chosen):
         names = list(chosen.model_fields)
         if keys[0] not in names:
+            names += [] if path else list(at.get("components") or ())
             raise _UnfitError(f"no key {keys[0]!r} in {where}{suggestion(keys[0], names, 'its keys')}")
         return keys[0], keys[1:]
     if get_origin(chosen) is dict and not isinstance(value, dict) and _sections(get_args(chosen)[1]):

@@ -180,6 +180,11 @@ def test_schema_is_printed_and_written(tmp_path: Path, capsys: pytest.CaptureFix
     assert (tmp_path / "s.json").read_text() == printed
 
 
+def test_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("exlinn ")
+
+
 def test_report_is_made_again(lag: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert exit_code(["run", str(lag), "--out", str(out)]) == 0
@@ -200,6 +205,7 @@ def test_report_is_made_again(lag: Path, tmp_path: Path) -> None:
         (["info", "missing.fmu"], "no such file"),
         (["info", "."], "not a run folder"),
         (["report", "."], "not a run folder"),
+        (["run", "."], "is a folder; give a scenario"),
         (["export", "plant", "dc_motor"], "there are: dc_motor_cart"),
     ],
 )

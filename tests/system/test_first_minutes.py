@@ -66,6 +66,14 @@ def test_a_draft_of_a_modelica_fmu_learns_it_as_it_stands(folder: Path) -> None:
     assert metrics("Mass_Damper")["learn.mass_matrix_min_eigenvalue"] == pytest.approx(1.0, rel=1e-6)
 
 
+def test_an_fmu_that_takes_euler_steps_is_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code(["init", str(other_fmus()["Mass_Damper"]), "--out", "m.yaml"]) == 0
+    assert exit_code(["collect", "m.yaml"]) == 0
+    assert "Euler" not in capsys.readouterr().err
+    assert exit_code(["collect", "m.yaml", "--set", "components.plant.interface=co_simulation"]) == 0
+    assert "'mass.s' goes by Euler steps" in capsys.readouterr().err
+
+
 def test_a_draft_of_recordings_learns_them_as_it_stands(folder: Path, root: Path) -> None:
     files = [str(root / f"scenarios/data/motor_{k}.csv") for k in (1, 2, "test")]
     assert exit_code(["init", *files, "--out", "motor.yaml"]) == 0
