@@ -162,14 +162,14 @@ def _check_members(path: Path, members: Sequence[zipfile.ZipInfo]) -> None:
     files, folders = set[PurePosixPath](), set[PurePosixPath]()
     for info in members:
         name = info.filename
-        parts = PurePosixPath(name)
+        parts = PurePosixPath(name.replace("\\", "/"))
+        if parts.is_absolute() or ".." in parts.parts or ":" in name:
+            raise FmuError(f"{path}: the archive holds {name!r}, which would be written outside its folder")
         if "\\" in name:
             raise FmuError(
                 f"{path}: the archive holds {name!r}, and names in archives take '/': zip it again, or "
                 "export it with a newer version of its tool"
             )
-        if parts.is_absolute() or ".." in parts.parts or ":" in name:
-            raise FmuError(f"{path}: the archive holds {name!r}, which would be written outside its folder")
         if not name.isprintable():
             raise FmuError(f"{path}: the archive holds {name!r}, which is no file name")
         if parts in files or (parts in folders and not info.is_dir()):

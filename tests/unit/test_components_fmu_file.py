@@ -158,6 +158,14 @@ def test_a_huge_model_description_is_not_read(tmp_path: Path, monkeypatch: pytes
 # ── an archive that means harm ───────────────────────────────────────────────────────────────────────────
 
 
+def test_backslashes_of_old_tools_are_named_as_such(tmp_path: Path) -> None:
+    path = pack(
+        tmp_path / "Probe.fmu", {"modelDescription.xml": description_2(), "binaries\\win32\\a.dll": ""}
+    )
+    with pytest.raises(FmuError, match="names in archives take '/'"):
+        FmuComponent("probe", path)
+
+
 @pytest.mark.parametrize("name", ["../evil.txt", "/etc/evil.txt", "a/../../evil.txt", "..\\evil", "C:/evil"])
 def test_members_outside_the_folder_are_refused(tmp_path: Path, name: str) -> None:
     path = pack(tmp_path / "Probe.fmu", {"modelDescription.xml": description_2(), name: "evil"})
