@@ -229,7 +229,7 @@ def test_a_missing_file_names_the_nearest(tmp_path):
 
 
 def test_a_folder_is_no_scenario(tmp_path):
-    with pytest.raises(ScenarioError, match="cannot be read: Is a directory"):
+    with pytest.raises(ScenarioError, match="is a folder; give a scenario"):
         load_scenario(tmp_path)
 
 
