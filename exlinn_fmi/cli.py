@@ -185,11 +185,14 @@ def validate(scenario: ScenarioFile, overrides: Overrides = None) -> None:
 
     Example: exlinn validate scenarios/dcwc_paper.yaml
     """
+    from exlinn_fmi.describe import describe_purpose
     from exlinn_fmi.workspace import Run
 
     work = Run.open(scenario, None, overrides or ())
     parts = f"{len(work.scenario.components)} components, {len(work.scenario.connection_list())} connections"
     typer.echo(f"{scenario}: valid ({parts})")
+    for line in describe_purpose(work.scenario):
+        typer.echo(f"  {line}")
 
 
 @app.command()
@@ -348,8 +351,10 @@ def show_metrics(folder: Path, *prefixes: str) -> None:
     """Print the metrics of a run folder that have a value, one a line."""
     from exlinn_fmi.workspace import metrics
 
-    known = {k: v for k, v in metrics(folder).items() if v is not None or k.startswith("learn.rollout")}
-    values = {k: v for k, v in known.items() if k.startswith(prefixes or ("",))}
+    known = metrics(folder)
+    if known.get("learn.rollout_diverged"):
+        known = {k: "diverged" if v is None and "rollout" in k else v for k, v in known.items()}
+    values = {k: v for k, v in known.items() if v is not None and k.startswith(prefixes or ("",))}
     width = max(map(len, values), default=0)
     for name, value in values.items():
         typer.echo(

@@ -12,6 +12,7 @@ from exlinn_fmi.data.files import read_json
 from exlinn_fmi.errors import InputError
 
 if TYPE_CHECKING:
+    from exlinn_fmi.scenario.schema import Scenario
     from exlinn_fmi.workspace import Run
 
 ORDER = ("independent", "input", "output", "parameter", "local")
@@ -81,22 +82,12 @@ def describe_scenario(file: Path, overrides: Sequence[str]) -> str:
     from exlinn_fmi.cosim.graph import Graph
     from exlinn_fmi.factory import outline
     from exlinn_fmi.scenario.events import event_names
-    from exlinn_fmi.scenario.learning import LearnFromData
     from exlinn_fmi.workspace import Run
 
     work = Run.open(file, None, overrides)
     components = {name: outline(name, work.scenario, work.loaded.folder) for name in work.scenario.components}
     lines = [f"{work.scenario.name}: {work.scenario.description}".rstrip(": ")]
-    if work.scenario.learn:
-        learn = work.scenario.learn
-        names = ", ".join(c.name for c in learn.coordinates)
-        if isinstance(learn, LearnFromData):
-            tests = learn.data.hold_out or len(learn.data.test)
-            training = len(learn.data.files) - learn.data.hold_out
-            lines.append(f"learns from measured files in {names}: {training} for training, {tests} held out")
-        else:
-            experiments = f"{len(learn.training)} training experiments, {len(learn.test)} tests"
-            lines.append(f"learns {learn.plant} in {names}: {experiments}")
+    lines += describe_purpose(work.scenario)
     apart = [name for name in components if runs_apart(name, work)]
     if apart:
         lines.append(f"isolated, in processes of their own: {', '.join(apart)}")
@@ -111,6 +102,25 @@ def describe_scenario(file: Path, overrides: Sequence[str]) -> str:
         lines.append("events")
         lines += [f"  {n:<{width}}  {e.words()}" for n, e in zip(labels, work.scenario.events, strict=True)]
     return "\n".join(lines)
+
+
+def describe_purpose(scenario: Scenario) -> list[str]:
+    """What a scenario does: what it learns, from what, and what it simulates."""
+    from exlinn_fmi.scenario.learning import LearnFromData
+
+    lines, learn, span = [], scenario.learn, scenario.simulate
+    if learn:
+        names = ", ".join(c.name for c in learn.coordinates)
+        if isinstance(learn, LearnFromData):
+            tests = learn.data.hold_out or len(learn.data.test)
+            training = len(learn.data.files) - learn.data.hold_out
+            lines.append(f"learns from measured files in {names}: {training} for training, {tests} held out")
+        else:
+            experiments = f"{len(learn.training)} training experiments, {len(learn.test)} tests"
+            lines.append(f"learns {learn.plant} in {names}: {experiments}")
+    if span:
+        lines.append(f"simulates {span.stop - span.start:g} s in steps of {span.step:g} s")
+    return lines or ["does nothing yet: it has neither `learn` nor `simulate`"]
 
 
 def runs_apart(name: str, work: Run) -> bool:

@@ -32,7 +32,8 @@ GUARD = 0.8
 CLOSE = 0.25
 """Rows are close to each other that lie less than this share of the usual step apart."""
 NO_TEST = (
-    "no file is held out (`test` or `hold_out`): the report card judges the model on what it was trained on"
+    "no file is held out (`test` or `hold_out`): nothing tells how good the model is on data that it has not "
+    "seen, and the figure shows it on what it was trained on; give it another recording"
 )
 
 Signal = Float[NDArray[np.float64], " N"]
