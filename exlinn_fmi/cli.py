@@ -94,6 +94,15 @@ class Terminal:
             self.task = None
 
 
+def tell_inputs(scenario: Path, overrides: list[str]) -> None:
+    """Say that the inputs of an FMU that is run by itself are held, unless one was set."""
+    if scenario.suffix.lower() == ".fmu" and not any(text.startswith("plant.") for text in overrides):
+        from exlinn_fmi.drafting import held_inputs
+
+        if said := held_inputs(scenario):
+            typer.echo(said, err=True)
+
+
 def perform(work: Callable[[Run], object], file: Path, out: Path | None, overrides: list[str] | None) -> Run:
     """Do some work on a scenario, with progress shown and Ctrl-C minded."""
     from exlinn_fmi.workspace import Run
@@ -153,6 +162,7 @@ def run(
     began = time.perf_counter()
     overrides = [*(overrides or ()), *shorthand(stop, step, record)]
     work = perform(lambda work: pipeline.run(work, resume), scenario, out, overrides)
+    tell_inputs(scenario, overrides)
     show_metrics(work.folder)
     typer.echo(f"\n{work.folder / 'report.html'}  ({time.perf_counter() - began:.1f} s)")
 
@@ -273,6 +283,7 @@ def simulate(
 
     overrides = [*(overrides or ()), *shorthand(stop, step, record)]
     work = perform(lambda work: pipeline.simulate(work, resume), scenario, out, overrides)
+    tell_inputs(scenario, overrides)
     show_metrics(work.folder, "control.", "simulate.")
     typer.echo(f"\n{work.folder / 'trajectories.csv'}")
 

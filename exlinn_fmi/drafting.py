@@ -40,6 +40,17 @@ def draft(files: Sequence[Path], out: Path | None = None) -> str:
     return f"{target}  ({todo} places to look at, marked TODO)\n\n{following}"
 
 
+def held_inputs(file: Path) -> str:
+    """What the user of an FMU by itself should know of its inputs; nothing where it has none."""
+    from exlinn_fmi.components.fmu_file import read_description
+    from exlinn_fmi.scenario.draft import PLANT
+
+    names = [f"{PLANT}.{v.name}" for v in read_description(file).variables if v.causality == "input"]
+    shown = ", ".join(names[:6]) + (", …" if len(names) > 6 else "")
+    ways = f"--set {names[0]}=VALUE, or signals: exlinn init {shlex.quote(str(file))}" if names else ""
+    return f"inputs are held at their start values: {shown} ({ways})" if names else ""
+
+
 def _checked(file: Path) -> bool:
     """Whether a file is there and of a kind that a scenario can be written for.
 

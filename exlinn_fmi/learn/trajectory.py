@@ -145,7 +145,8 @@ class Information:
         values, vectors, size = self._scaled
         kept = values > SINGULAR * values.max()
         inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
-        return np.asarray(inverse / size[:, None] / size)
+        with np.errstate(over="ignore"):  # what the data say nothing of has no finite variance
+            return np.asarray(inverse / size[:, None] / size)
 
     @property
     def unknown(self) -> Float[Array, "D P"]:

@@ -59,6 +59,14 @@ def test_inputs_parameters_and_what_is_recorded_are_set_in_one_line(folder: Path
     assert Path("runs/DCMotorCart_fmu/report.html").exists()
 
 
+def test_inputs_that_are_held_are_named(folder: Path, root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["simulate", str(root / "fmus/DCMotorCart.fmu"), "--stop", "0.1"]
+    assert exit_code(command) == 0
+    assert "held at their start values: plant.tau_ext, plant.v (--set" in capsys.readouterr().err
+    assert exit_code([*command, "--set", "plant.v=1"]) == 0
+    assert "held" not in capsys.readouterr().err
+
+
 def test_a_draft_of_a_modelica_fmu_learns_it_as_it_stands(folder: Path) -> None:
     assert exit_code(["init", str(other_fmus()["Mass_Damper"])]) == 0
     assert exit_code(["train", "Mass_Damper.yaml", "--set", "learn.test[0].duration=2"]) == 0
