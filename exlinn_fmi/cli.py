@@ -170,7 +170,7 @@ def run(
 @app.command()
 def init(
     files: Annotated[
-        list[Path], typer.Argument(help="An FMU, or recordings (CSV, Parquet).", metavar="FILE...")
+        list[Path], typer.Argument(help="An FMU, or recordings (CSV, Parquet).", metavar="FILE")
     ],
     out: Annotated[
         Path | None,
