@@ -118,6 +118,26 @@ def inverse_assembly(spec: ModelSpec, samples: Samples) -> Assembly:
     return Assembly(z, basis, slopes, w, value, gradient, np.ones_like(w), samples.F / spec.scales.force)
 
 
+def weak_assembly(spec: ModelSpec, samples: Samples) -> Assembly:
+    """Coefficients of the momenta M q̇ at B samples, then those of all that is left of (11) but d/dt (M q̇).
+
+    Args:
+        spec: a structured model.
+        samples: the data; accelerations and forces are not looked at.
+    """
+    assert spec.scales is not None
+    speeds = samples._replace(a=samples.v / spec.scales.time, F=np.zeros_like(samples.F))
+    whole = inverse_assembly(spec, speeds)
+    momenta = whole.inertia()
+    owners = list(spec.layout.owners)
+    rate = topology_features(spec, samples.q)[1] * np.array(spec.scales.position)[owners]
+    rate = rate * whole.velocity[:, owners]  # ż
+    change = momenta.value[..., None] * rate[:, None, None]  # Ṁ q̇ is part of d/dt (M q̇)
+    rest = replace(whole, value=np.zeros_like(whole.value), gradient=whole.gradient - change)
+    parts = {f.name: (getattr(momenta, f.name), getattr(rest, f.name)) for f in fields(Assembly)}
+    return Assembly(**{name: np.concatenate(pair) for name, pair in parts.items()})
+
+
 def product_basis(
     z: Float[Array, "B nz"], products: Sequence[tuple[int, ...]]
 ) -> tuple[Float[Array, "B H"], Float[Array, "B H nz"]]:

@@ -8,14 +8,14 @@ In the mean over the equations of motion:
 An equation without input is homogeneous: against a fixed scale a model could shrink it until nothing is left
 to explain; against its own size it cannot. Both are free of units. The objective is the loss + λ‖θ‖².
 
-Rows are samples of the inverse model (17). Their Jacobian is reduced to a triangle chunk by chunk (QR of what
+Rows are samples of the inverse model (17), or the equations against test functions (`Weak`). Their Jacobian is reduced to a triangle chunk by chunk (QR of what
 was there and what comes), so that no sum of squares loses half of the digits and no large array is kept.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -41,10 +41,24 @@ SLICE = 512
 class Rows(ABC):
     """Rows of the equations of motion for θ; N rows of n equations, dimensionless."""
 
+    networks: StructuredNetworks
+
     @property
     @abstractmethod
     def target(self) -> Float[Array, "N n"]:
         """Forces."""
+
+    @abstractmethod
+    def thin(self, most: int) -> Rows:
+        """About as many of the rows, evenly."""
+
+    @abstractmethod
+    def samples(self, most: int) -> Assembly:
+        """About as many of the samples that the rows are made of, evenly."""
+
+    @abstractmethod
+    def gather(self, make: Callable[[Assembly], Float[Array, "B n k"]]) -> Float[Array, "N n k"]:
+        """Rows of what is made at samples, linear in their coefficients; forces left out."""
 
     @abstractmethod
     def chunks(self) -> Iterator[Rows]:
@@ -89,6 +103,18 @@ class Inverse(Rows):
     def target(self) -> Float[Array, "N n"]:
         """Forces."""
         return self.data.target
+
+    def thin(self, most: int) -> Inverse:
+        """Every k-th sample."""
+        return Inverse(self.networks, self.samples(most))
+
+    def samples(self, most: int) -> Assembly:
+        """The same."""
+        return self.data.part(slice(None, None, -(-len(self.data) // most)))
+
+    def gather(self, make: Callable[[Assembly], Float[Array, "N n k"]]) -> Float[Array, "N n k"]:
+        """Each sample is a row."""
+        return make(self.data)
 
     def chunks(self) -> Iterator[Inverse]:
         """Parts of `CHUNK` samples, or fewer."""

@@ -13,7 +13,7 @@ where a descent from silent units takes hundreds of iterations.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations_with_replacement
 from typing import NamedTuple
 
@@ -25,7 +25,8 @@ from scipy.optimize import nnls
 from exlinn_fmi.learn.assembly import Assembly, product_basis
 from exlinn_fmi.learn.factor import fit_cholesky, fit_factor
 from exlinn_fmi.learn.levenberg import triangle
-from exlinn_fmi.learn.networks import StructuredNetworks, coupling_columns
+from exlinn_fmi.learn.networks import coupling_columns
+from exlinn_fmi.learn.objective import Rows
 from exlinn_fmi.mechanics.layout import Layout, Mask
 
 Array = NDArray[np.float64]
@@ -67,6 +68,14 @@ class Start(NamedTuple):
     epsilon: tuple[float, ...]
 
 
+class _Family(NamedTuple):
+    """At samples: functions of position for M, those for A and V, and each velocity's friction (B, n, f)."""
+
+    mass: Basis
+    others: Basis
+    friction: Array
+
+
 class _Solution(NamedTuple):
     """Coefficients of A and V by term, K, offsets, friction, M and ∂M/∂z at the samples, sizes of forces.
 
@@ -82,20 +91,23 @@ class _Solution(NamedTuple):
     forces: Float[Array, " n"]
 
 
-def linear_start(layout: Layout, data: Assembly, seed: int) -> Start:
+def linear_start(rows: Rows, seed: int) -> Start:
     """Weights to start from, hidden units silent.
 
     Args:
-        layout: of the networks.
-        data: coefficients of the inverse model.
+        rows: what is to be explained.
         seed: of all that is drawn.
     """
-    part = data.part(slice(None, None, -(-len(data) // SAMPLES)))
+    layout, rows = rows.networks.spec.layout, rows.thin(SAMPLES)
+    part = rows.samples(SAMPLES)
     pairs = list(combinations_with_replacement(range(part.z.shape[1]), 2))
     masks = [layout.term_mask(t, pairs if t[0] == "M" else layout.products) for t in layout.terms]
-    friction = part.velocity[:, :, None] * layout.free["dissipation.viscous"][:, None]
-    bases = product_basis(part.z, pairs), (part.basis, part.slopes)
-    found = next(_solve(layout, part, *bases, masks, friction, (CUT,)))
+
+    def family(at: Assembly) -> _Family:
+        friction = at.velocity[:, :, None] * layout.free["dissipation.viscous"][:, None]
+        return _Family(product_basis(at.z, pairs), (at.basis, at.slopes), friction)
+
+    found = next(_solve(rows, family, masks, (CUT,)))
     random = np.random.default_rng(seed)
     weights = {name: np.zeros(shape) for name, shape in layout.shapes.items()}
     epsilon = np.zeros(len(found.forces))
@@ -120,28 +132,33 @@ def linear_start(layout: Layout, data: Assembly, seed: int) -> Start:
 
 
 def hidden_starts(
-    networks: StructuredNetworks, weights: dict[str, Array], data: Assembly
+    rows: Rows, weights: dict[str, Array]
 ) -> Iterator[dict[str, Array]]:
     """Weights to start from with hidden units that take part from the first: better, or far too rich.
 
     The more singular values a solve keeps, the closer it is to clean data and the further off on others.
 
     Args:
-        networks: with their smallest masses ε.
+        rows: what is to be explained, of networks with their smallest masses ε.
         weights: whose hidden units are taken as they are.
-        data: coefficients of the inverse model.
     """
-    layout, part = networks.spec.layout, data.part(slice(None, None, -(-len(data) // SAMPLES)))
-    free, basis = layout.free, networks.basis(weights, part)
+    networks, rows = rows.networks, rows.thin(SAMPLES)
+    layout = networks.spec.layout
+    free, basis = layout.free, networks.basis(weights, rows.samples(SAMPLES))
     free["lagrangian.output"][:, COLUMNS // len(layout.terms) :] = False
-    rows = dict(zip(layout.outputs, free["lagrangian.output"], strict=True))
-    masks = [rows[("L", i, 0) if kind == "M" else (kind, i, j)] for kind, i, j in layout.terms]
+    used = dict(zip(layout.outputs, free["lagrangian.output"], strict=True))
+    masks = [used[("L", i, 0) if kind == "M" else (kind, i, j)] for kind, i, j in layout.terms]
     kinds = [
         free[f"dissipation.{kind}"].reshape(len(weights["dissipation.viscous"]), -1) for kind in FRICTION
     ]
-    friction = networks.friction(weights, part) * np.concatenate(kinds, axis=1)
+    friction = np.concatenate(kinds, axis=1)
+
+    def family(at: Assembly) -> _Family:
+        functions = networks.basis(weights, at)
+        return _Family(functions, functions, networks.friction(weights, at) * friction)
+
     epsilon = np.array(networks.spec.epsilon)
-    for found in _solve(layout, part, basis, basis, masks, friction, CUTS):
+    for found in _solve(rows, family, masks, CUTS):
         now = {name: array.copy() for name, array in weights.items()}
         output = now["lagrangian.output"]
         output[:] = 0
@@ -150,10 +167,10 @@ def hidden_starts(
             room = mass + np.diag(least - epsilon[block])  # M − ε, with the ε that the model has
             if not np.linalg.eigvalsh(room).min() > 0:
                 break
-            used = np.flatnonzero(rows["L", block[0], 0])
-            factor = fit_cholesky(room, change, basis[0][:, used], basis[1][:, used])
+            part = np.flatnonzero(used["L", block[0], 0])
+            factor = fit_cholesky(room, change, basis[0][:, part], basis[1][:, part])
             for k, i in enumerate(block):
-                output[layout.rows[i]][: len(block), used] = factor[k]
+                output[layout.rows[i]][: len(block), part] = factor[k]
         else:
             _fill(layout, now, found)
             strength = np.sqrt(np.maximum(found.friction, SILENT * found.forces[:, None]))
@@ -189,68 +206,80 @@ def _fill(layout: Layout, weights: dict[str, Array], found: _Solution) -> None:
 
 
 def _solve(
-    layout: Layout,
-    part: Assembly,
-    mass_basis: Basis,
-    basis: Basis,
-    masks: Sequence[Mask],
-    friction: Float[Array, "B n f"],
-    cuts: Sequence[float],
+    rows: Rows, family: Callable[[Assembly], _Family], masks: Sequence[Mask], cuts: Sequence[float]
 ) -> Iterator[_Solution]:
     """Weighted linear least squares for everything at once, for each cut of the singular values.
 
     Friction, which must not be negative, is solved for on what the others leave open.
 
     Args:
-        layout: of the networks.
-        part: the samples.
-        mass_basis: functions of position for M, and their derivatives.
-        basis: those for A and V, where the first, a constant, has no effect.
+        rows: what is to be explained.
+        family: functions that take part, at samples.
         masks: for each term which of its functions may take part.
-        friction: friction of each velocity in its own equation.
         cuts: singular values below this share of the largest are left out.
     """
-    n, free = part.velocity.shape[1], layout.free
-    bases: list[Basis] = []
-    columns = []
-    for t, (term, mask) in enumerate(zip(layout.terms, masks, strict=True)):
-        used = mask if term[0] == "M" else mask & (np.arange(len(mask)) > 0)
-        values, slopes = mass_basis if term[0] == "M" else basis
-        values, slopes = values * used, slopes * used[:, None]
-        column = part.value[:, :, t, None] * values[:, None]
-        columns.append(column + np.einsum("bnz,bhz->bnh", part.gradient[:, :, t], slopes))
-        bases.append((values, slopes))
-    columns.append(coupling_columns(layout, part.velocity) * free["lagrangian.coupling"])
-    columns.append(-np.broadcast_to(np.eye(n), (len(part), n, n)) * free["lagrangian.offset"])
-    columns.append((friction[:, :, None] * np.eye(n)[:, :, None]).reshape(len(part), n, -1))
-    size = np.sqrt(np.mean(part.target**2, axis=0))
+    layout, target = rows.networks.spec.layout, rows.target
+    # The first function of A and V, a constant, has no effect.
+    masks = [
+        mask if term[0] == "M" else mask & (np.arange(len(mask)) > 0)
+        for term, mask in zip(layout.terms, masks, strict=True)
+    ]
+    columns = _columns(rows, family, masks)
+    places = np.cumsum([column.shape[2] for column in columns])[:-1]
+    size = np.sqrt(np.mean(target**2, axis=0))
     weight = 1 / np.where(size > 0, size, 1)
-    matrix = (np.concatenate(columns, axis=2) * weight[:, None]).reshape(part.target.size, -1)
+    matrix = (np.concatenate(columns, axis=2) * weight[:, None]).reshape(target.size, -1)
     size = np.linalg.norm(matrix, axis=0)
     size[size == 0] = 1
-    free = matrix.shape[1] - columns[-1].shape[2]
-    r = triangle(np.column_stack([matrix / size, (part.target * weight).ravel()]))
-    left, singular, right = np.linalg.svd(r[:free, :free])
+    count = int(places[-1])
+    r = triangle(np.column_stack([matrix / size, (target * weight).ravel()]))
+    left, singular, right = np.linalg.svd(r[:count, :count])
+    n, part = target.shape[1], rows.samples(SAMPLES)
+    values, slopes = family(part).mass
     for cut in cuts:
         strong = singular > cut * singular.max()
         kept, lost = left[:, strong], left[:, ~strong]
-        rest = np.concatenate([lost.T @ r[:free, free:], r[free:, free:]])
+        rest = np.concatenate([lost.T @ r[:count, count:], r[count:, count:]])
         solution = np.empty(len(size))
-        solution[free:] = nnls(rest[:, :-1], rest[:, -1])[0]
-        target = kept.T @ (r[:free, -1] - r[:free, free:-1] @ solution[free:])
-        solution[:free] = right[strong].T @ (target / singular[strong])
-        parts = np.split(solution / size, np.cumsum([c.shape[2] for c in columns])[:-1])
+        solution[count:] = nnls(rest[:, :-1], rest[:, -1])[0]
+        goal = kept.T @ (r[:count, -1] - r[:count, count:-1] @ solution[count:])
+        solution[:count] = right[strong].T @ (goal / singular[strong])
+        parts = np.split(solution / size, places)
         mass, change = np.zeros((len(part), n, n)), np.zeros((len(part), n, n, part.z.shape[1]))
-        for (kind, i, j), (values, slopes), x in zip(layout.terms, bases, parts, strict=False):
+        for (kind, i, j), mask, x in zip(layout.terms, masks, parts, strict=False):
             if kind == "M":
-                mass[:, i, j] = mass[:, j, i] = values @ x
-                change[:, i, j] = change[:, j, i] = np.einsum("bhz,h->bz", slopes, x)
-        shares = [part.target, *(c @ x for c, x in zip(columns, parts, strict=True))]
+                mass[:, i, j] = mass[:, j, i] = values @ (mask * x)
+                change[:, i, j] = change[:, j, i] = np.einsum("bhz,h->bz", slopes, mask * x)
+        shares = [target, *(c @ x for c, x in zip(columns, parts, strict=True))]
         forces = np.max([np.sqrt(np.mean(share**2, axis=0)) for share in shares], axis=0)
         forces = np.maximum(forces, np.finfo(float).eps * forces.max())
         functions = {term: x for term, x in zip(layout.terms, parts, strict=False) if term[0] != "M"}
         coupling, offset, friction_found = parts[-3:]
         yield _Solution(functions, coupling, offset, friction_found.reshape(n, -1), mass, change, forces)
+
+
+def _columns(
+    rows: Rows, family: Callable[[Assembly], _Family], masks: Sequence[Mask]
+) -> list[Float[Array, "N n _"]]:
+    """What each coefficient contributes: one array for each term of 𝓛, then for K, offsets and friction."""
+    layout, sizes = rows.networks.spec.layout, list[int]()
+    free, n = layout.free, rows.target.shape[1]
+
+    def make(at: Assembly) -> Array:
+        mass, others, friction = family(at)
+        columns = []
+        for t, (term, mask) in enumerate(zip(layout.terms, masks, strict=True)):
+            values, slopes = mass if term[0] == "M" else others
+            column = at.value[:, :, t, None] * (values * mask)[:, None]
+            columns.append(column + np.einsum("bnz,bhz->bnh", at.gradient[:, :, t], slopes * mask[:, None]))
+        columns.append(coupling_columns(layout, at.velocity) * free["lagrangian.coupling"])
+        columns.append(-np.eye(n) * at.push[:, :, None] * free["lagrangian.offset"])
+        columns.append((friction[:, :, None] * np.eye(n)[:, :, None]).reshape(len(at), n, -1))
+        sizes[:] = [column.shape[2] for column in columns]
+        return np.concatenate(columns, axis=2)
+
+    whole = rows.gather(make)
+    return np.split(whole, np.cumsum(sizes)[:-1], axis=2)
 
 
 def _mass_block(

@@ -20,16 +20,16 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
-from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.assembly import data_scales, inverse_assembly
 from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.learn.lbfgs import lbfgs
 from exlinn_fmi.learn.levenberg import levenberg_marquardt
 from exlinn_fmi.learn.networks import StructuredNetworks
 from exlinn_fmi.learn.noise import CLEAN, relative_noise
-from exlinn_fmi.learn.objective import Inverse, Objective, loss
+from exlinn_fmi.learn.objective import Inverse, Objective, Rows, loss
 from exlinn_fmi.learn.refine import FLOOR, SWEEPS, Candidate, refine
 from exlinn_fmi.learn.start import Start, hidden_starts, linear_start
+from exlinn_fmi.learn.tested import Weak, usual_accelerations
 from exlinn_fmi.mechanics.learned import ModelSpec
 from exlinn_fmi.mechanics.structure import UNKNOWN, Structure
 from exlinn_fmi.scenario.learning import Objective as Goal
@@ -57,7 +57,11 @@ iteration, which grows with their square as its memory does."""
 
 
 def structured_spec(
-    train: Dataset, options: Structured, seed: int, structure: Structure = UNKNOWN
+    train: Dataset,
+    options: Structured,
+    seed: int,
+    structure: Structure = UNKNOWN,
+    objective: Goal = "auto",
 ) -> tuple[ModelSpec, Start]:
     """The model to train and its first weights.
 
@@ -66,13 +70,20 @@ def structured_spec(
         options: the learner's settings.
         seed: of what is drawn.
         structure: what is known of the plant.
+        objective: what is made small.
+
+    Raises:
+        DataError: the objective is `weak` and no trajectory is long enough for it.
     """
-    scales = data_scales(train.arrays, train.coordinates)
+    samples = train.arrays
+    if objective == "weak":
+        samples = samples._replace(a=usual_accelerations(train))
+    scales = data_scales(samples, train.coordinates)
     n = len(train.coordinates)
     spec = ModelSpec(
         "structured", train.coordinates, options.hidden, scales, epsilon=(0.0,) * n, structure=structure
     )
-    start = linear_start(spec.layout, inverse_assembly(spec, train.arrays), seed)
+    start = linear_start(equations(StructuredNetworks(spec), train, objective), seed)
     return replace(spec, epsilon=start.epsilon), start
 
 
@@ -117,13 +128,8 @@ def iterate_structured(
         The start of each stage and every iteration.
 
     Raises:
-        TrainingError: the objective is one for sums of terms alone.
+        DataError: the objective is `weak` and no trajectory is long enough for it.
     """
-    if objective == "weak":
-        raise TrainingError(
-            "the objective 'weak' takes the preset 'terms'; for networks choose 'trajectory', 'inverse' or "
-            "'auto'"
-        )
     networks = StructuredNetworks(spec)
     best: dict[str, Iterate] = {}
     notes: dict[str, Any] = {
@@ -131,7 +137,8 @@ def iterate_structured(
         "noise": relative_noise(train),
         "optimiser": optimiser(options, networks.size)[1],
     }
-    stages = _inverse(networks, start, train, validation, options)
+    parts = (equations(networks, part, objective) for part in (train, validation))
+    stages = _descend(*parts, start, options)
     for now, _ in zip(stages, range(options.iterations + 1), strict=False):
         for stage in {now.stage, "any"}:
             if stage not in best or now.rank < best[stage].rank:
@@ -176,14 +183,18 @@ def choose(objective: Goal, data: Dataset, loss: float = 0.0) -> tuple[Goal, str
     return "inverse", "inverse: the states are clean and the accelerations do not contradict them"
 
 
-def _inverse(
-    networks: StructuredNetworks, start: Start, train: Dataset, validation: Dataset, options: Structured
-) -> Iterator[Iterate]:
-    """The three stages on the inverse model."""
-    spec, first_order = networks.spec, optimiser(options, networks.size)[0] == "l-bfgs"
-    data, held = (Inverse(networks, inverse_assembly(spec, part.arrays)) for part in (train, validation))
-    enough = max(COARSE, EQUATIONS * networks.size // len(spec.coordinates) * first_order)
-    coarse = Inverse(networks, data.data.part(slice(None, None, -(-len(data.data) // enough))))
+def equations(networks: StructuredNetworks, data: Dataset, objective: Goal) -> Rows:
+    """What the first stages make small: the equations against test functions, or at the samples."""
+    if objective == "weak":
+        return Weak.of(networks, data)
+    return Inverse(networks, inverse_assembly(networks.spec, data.arrays))
+
+
+def _descend(data: Rows, held: Rows, start: Start, options: Structured) -> Iterator[Iterate]:
+    """The three stages on the inverse model or its weak form."""
+    networks, spec = data.networks, data.networks.spec
+    first_order = optimiser(options, networks.size)[0] == "l-bfgs"
+    coarse = data.thin(max(COARSE, EQUATIONS * networks.size // len(spec.coordinates) * first_order))
     theta, chosen, met = networks.pack(start.weights), networks.pack_mask(spec.layout.direct), False
     for stage, (patience, share) in PATIENCE.items():
         if stage == "hidden" and met:
@@ -215,8 +226,8 @@ def _inverse(
         theta[chosen] = step.theta
 
 
-def _best_start(theta: Float[Array, " P"], data: Inverse, held: Inverse) -> Float[Array, " P"]:
+def _best_start(theta: Float[Array, " P"], data: Rows, held: Rows) -> Float[Array, " P"]:
     """The weights as they are, hidden units silent, or those of a linear start, ranked as `Iterate` does."""
     networks = data.networks
-    starts = map(networks.pack, hidden_starts(networks, networks.unpack(theta), data.data))
+    starts = map(networks.pack, hidden_starts(data, networks.unpack(theta)))
     return min((theta, *starts), key=lambda start: loss(data, start) * loss(held, start))

@@ -25,7 +25,8 @@ from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.learn.noise import CLEAN, noise_levels, relative_noise
 from exlinn_fmi.learn.projection import Make, solve
 from exlinn_fmi.learn.trajectory import Fit, Information, Shooting, cut
-from exlinn_fmi.learn.weak import OVERLAP, Regression, inverse_regression, weak_regression
+from exlinn_fmi.learn.weak import Regression, inverse_regression, weak_regression
+from exlinn_fmi.learn.windows import OVERLAP
 from exlinn_fmi.mechanics.coordinates import Parameter, state_names
 from exlinn_fmi.mechanics.learned import ModelSpec
 from exlinn_fmi.mechanics.monomials import MonomialBasis

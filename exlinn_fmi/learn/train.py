@@ -189,7 +189,7 @@ def _learner(
         return spec, iterate_terms(spec, train, validation, objective, method), STAGES
     from exlinn_fmi.learn.structured import iterate_structured, most_iterations, structured_spec
 
-    spec, start = structured_spec(train, method, seed, structure)
+    spec, start = structured_spec(train, method, seed, structure, objective)
     unknowns = sum(int(mask.sum()) for mask in spec.layout.free.values())
     if len(train) * len(train.coordinates) < unknowns:
         raise DataError(

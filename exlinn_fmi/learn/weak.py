@@ -1,35 +1,24 @@
-"""Euler–Lagrange equations against smooth test functions: linear least squares without accelerations.
+"""Equations of motion as linear least squares for the coefficients of terms: (17) at samples, or weakly.
 
-With φ of compact support, ∫ φ F dt = ∫ (−φ̇ ∂𝓛/∂q̇ − φ ∂𝓛/∂q + φ ∂D/∂q̇) dt: no derivative of the data is needed
-and noise is averaged over the windows. It needs no start, which makes it the start for everything else.
-
-References: Messenger, Bortz (2021), Multiscale Model. Simul. 19, 1474 (weak form); eq. (11).
+Against test functions (`windows`) no derivative of the data is needed and noise is averaged. That needs no
+start, which makes it the start for everything else.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
+from exlinn_fmi.learn.windows import windows
 from exlinn_fmi.mechanics.euler_lagrange import evaluate
 from exlinn_fmi.mechanics.monomials import MonomialBasis
 
 Array = NDArray[np.float64]
 
-LONGEST = 1600
-"""Rows in a window, …"""
-WINDOWS = 6
-"""… unless that many windows do not fit into the longest trajectory beside one another."""
-OVERLAP = 16
-"""Windows begin a 16th of their length apart."""
-BUMP: Polynomial = Polynomial([1, 0, -1]) ** 7
-"""φ(s) on [−1, 1], six times differentiable at the ends."""
 CUT = 1e-12
 """Singular values below this share of the largest are not determined."""
 
@@ -115,17 +104,16 @@ def weak_regression(basis: MonomialBasis, data: Dataset, p: Float[Array, " P"] |
         p: where its columns are taken, if it has shapes; at its start if not given.
     """
     scale, at = force_scale(data), basis.start if p is None else p
-    momenta, rest = basis.momenta, basis.rest
     q, v, _, _ = data.arrays
-    force = data.recorded_forces
-    columns, forces = [], []
-    for rows, phi, slope, held in _windows(data):
+    force, tested = data.recorded_forces, windows(data)
+    columns, forces = np.zeros((len(tested), v.shape[1], len(at))), np.zeros((len(tested), v.shape[1]))
+    for rows, some, phi, slope, held in tested.pieces():
         shape = (len(rows), v.shape[1], len(at))
-        m = evaluate(momenta, q[rows], v[rows], at).reshape(shape)
-        r = evaluate(rest, q[rows], v[rows], at).reshape(shape)
-        columns.append(np.tensordot(phi, r, axes=(1, 0)) - np.tensordot(slope, m, axes=(1, 0)))
-        forces.append(held @ force[rows])
-    return Regression(np.concatenate(columns) / scale[:, None], np.concatenate(forces) / scale, basis.size)
+        m = evaluate(basis.momenta, q[rows], v[rows], at).reshape(shape)
+        r = evaluate(basis.rest, q[rows], v[rows], at).reshape(shape)
+        columns[some] += np.tensordot(phi, r, axes=1) - np.tensordot(slope, m, axes=1)
+        forces[some] += held @ force[rows]
+    return Regression(columns / scale[:, None], forces / scale, basis.size)
 
 
 def force_scale(data: Dataset) -> Float[Array, " n"]:
@@ -135,26 +123,3 @@ def force_scale(data: Dataset) -> Float[Array, " n"]:
     speed = np.where(speed > 0, speed, speed.max() or 1.0)
     power = np.sqrt(np.mean(force**2, axis=0)) * speed
     return np.asarray(power.max() / speed)
-
-
-def _windows(data: Dataset) -> Iterator[tuple[NDArray[np.intp], Array, Array, Array]]:
-    """For each trajectory its rows, and on them (C windows) h φ, h φ̇ and ∫φ over each row's step."""
-    numbers = data.frame["trajectory"].to_numpy()
-    time = data.frame["time"].to_numpy(dtype=float)
-    rows = [np.flatnonzero(numbers == k) for k in data.trajectories]
-    longest = max(map(len, rows))
-    half = max(min(LONGEST, longest // WINDOWS, longest - 1) // 2, 2)
-    integral = BUMP.integ()
-    s = np.arange(-half, half + 1) / half
-    for part in rows:
-        centres = np.arange(half, len(part) - half, max(2 * half // OVERLAP, 1))
-        if not len(centres):
-            continue
-        step = float(np.median(np.diff(time[part])))
-        phi, slope, held = (np.zeros((len(centres), len(part))) for _ in range(3))
-        for c, centre in enumerate(centres):
-            inside = slice(centre - half, centre + half + 1)
-            phi[c, inside] = BUMP(s) / half
-            slope[c, inside] = BUMP.deriv()(s) / (half**2 * step)
-            held[c, inside][:-1] = np.diff(integral(s))
-        yield part, phi, slope, held

@@ -15,6 +15,8 @@ from exlinn_fmi.data.dataset import Dataset, split
 from exlinn_fmi.errors import DataError, TrainingError
 from exlinn_fmi.learn.card import force_error
 from exlinn_fmi.learn.identify import identify
+from exlinn_fmi.learn.networks import StructuredNetworks
+from exlinn_fmi.learn.objective import Inverse
 from exlinn_fmi.learn.rollout import free_run, nrmse
 from exlinn_fmi.learn.start import linear_start
 from exlinn_fmi.learn.structured import iterate_structured, structured_spec
@@ -171,7 +173,7 @@ def test_a_negative_mass_in_the_data_is_not_believed() -> None:
     data = motor_cart_dataset(1.0)
     odd = Dataset(data.frame.assign(i_dot=-data.frame["i_dot"]), MOTOR_CART)
     spec, _ = structured_spec(odd, OPTIONS, 0)
-    start = linear_start(spec.layout, inverse_assembly(spec, odd.arrays), 0)
+    start = linear_start(Inverse(StructuredNetworks(spec), inverse_assembly(spec, odd.arrays)), 0)
     rows = spec.layout.rows[1]
     assert start.weights["lagrangian.output"][rows, 0].any()
 
