@@ -59,53 +59,52 @@ class Piece(NamedTuple):
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows of equally many rows that overlap; dt is in units of half a window.
+    """Windows that overlap; dt is in units of half a window.
 
     Args:
         time: of all rows [s].
         first: row that each window begins with, in their order.
-        length: rows in each.
+        end: row that comes after its last.
     """
 
     time: Float[Array, " N"]
     first: Int[NDArray[np.intp], " W"]
-    length: int
+    end: Int[NDArray[np.intp], " W"]
 
     def __len__(self) -> int:
         return len(self.first)
 
     def thin(self, most: int) -> Windows:
         """At most so many of them, evenly."""
-        return replace(self, first=self.first[:: -(-len(self) // most)])
+        kept = slice(None, None, -(-len(self) // most))
+        return replace(self, first=self.first[kept], end=self.end[kept])
 
     def pieces(self) -> Iterator[Piece]:
         """All rows that a window holds, `PIECE` at a time."""
         last = len(self.time) - 1
-        ends = np.stack([self.time[self.first], self.time[self.first + self.length - 1]])
+        ends = np.stack([self.time[self.first], self.time[self.end - 1]])
         middle, half = ends.mean(axis=0)[:, None], np.ptp(ends, axis=0)[:, None] / 2
         for start in range(0, len(self.time), PIECE):
             rows = np.arange(start, min(start + PIECE, last + 1))
             some = slice(
-                int(np.searchsorted(self.first, start - self.length, "right")),
+                int(np.searchsorted(self.end, start, "right")),
                 int(np.searchsorted(self.first, rows[-1], "right")),
             )
             if some.start == some.stop:
                 continue
-            place = rows - self.first[some, None]
-            inside = (place >= 0) & (place < self.length)
-            kept = inside.any(axis=0)
-            rows, inside, place = rows[kept], inside[:, kept], place[:, kept]
+            inside = (rows >= self.first[some, None]) & (rows < self.end[some, None])
+            rows, inside = rows[inside.any(axis=0)], inside[:, inside.any(axis=0)]
             before, now, after = (
                 np.clip((self.time[np.clip(at, 0, last)] - middle[some]) / half[some], -1, 1)
                 for at in (rows - 1, rows, rows + 1)
             )
             step = np.where(inside, (after - before) / 2, 0)
-            held = np.where(inside & (place < self.length - 1), INTEGRAL(after) - INTEGRAL(now), 0)
+            held = np.where(inside & (rows < self.end[some, None] - 1), INTEGRAL(after) - INTEGRAL(now), 0)
             yield Piece(rows, some, BUMP(now) * step, SLOPE(now) * step / half[some], held)
 
 
 def windows(data: Dataset) -> Windows:
-    """Windows in all trajectories that are long enough, as long as the longest one asks for.
+    """Windows in all trajectories, as long as the longest one asks for, shorter in those that are shorter.
 
     Args:
         data: trajectories.
@@ -121,7 +120,13 @@ def windows(data: Dataset) -> Windows:
             f"data set: the longest trajectory has {longest} rows, expected at least {SHORTEST} for the "
             "objective 'weak'; record for longer, or choose 'inverse'"
         )
-    half = max(min(LONGEST, longest // WINDOWS, longest - 1) // 2, 2)
-    length, apart = 2 * half + 1, max(2 * half // OVERLAP, 1)
-    first = [np.arange(a, b - length + 1, apart) for a, b in zip(begins[:-1], begins[1:], strict=True)]
-    return Windows(data.frame["time"].to_numpy(dtype=float), np.concatenate(first), length)
+    most = max(min(LONGEST, longest // WINDOWS, longest - 1) // 2, 2)
+    firsts, lengths = [], []
+    for begin, end in zip(begins[:-1], begins[1:], strict=True):
+        half = most if 2 * most < end - begin else (end - begin - 1) // 4
+        if half < max(most // OVERLAP, 2):
+            continue  # derivatives of test functions grow as windows become short, and noise with them
+        firsts.append(np.arange(begin, end - 2 * half, max(2 * half // OVERLAP, 1)))
+        lengths.append(np.full(len(firsts[-1]), 2 * half + 1))
+    first = np.concatenate(firsts)
+    return Windows(data.frame["time"].to_numpy(dtype=float), first, first + np.concatenate(lengths))
