@@ -21,6 +21,8 @@ from scipy.integrate import cumulative_trapezoid
 from exlinn_fmi.data.dataset import Dataset, Samples
 from exlinn_fmi.learn.assembly import inverse_assembly
 from exlinn_fmi.learn.networks import StructuredNetworks
+from exlinn_fmi.learn.objective import Inverse, Rows
+from exlinn_fmi.learn.tested import Weak
 from exlinn_fmi.learn.train import TrainedModel
 from exlinn_fmi.learn.trajectory import Information
 from exlinn_fmi.mechanics.coordinates import Coordinate
@@ -115,13 +117,16 @@ def _forces(model: TrainedModel, data: Dataset) -> _Forces:
         samples = Samples(*(np.broadcast_to(x, v.shape) for x in (q, v, a, np.zeros(v.shape))))
         return networks.jacobian(theta, inverse_assembly(spec, samples))[1] * unit[:, None]
 
-    rows = np.linspace(0, len(data) - 1, min(len(data), SAMPLES)).astype(int)
-    residual, slopes = networks.jacobian(
-        theta, inverse_assembly(spec, Samples(*(x[rows] for x in data.arrays)))
-    )
+    rows: Rows
+    if model.provenance["objective"].startswith("weak"):
+        rows = Weak.all(networks, data)
+        share = rows.windows.overlap  # windows that share their samples tell the same
+    else:
+        rows = Inverse(networks, inverse_assembly(spec, data.arrays)).thin(SAMPLES)
+        share = len(rows.target) / len(data)
+    residual, slopes = rows.jacobian(theta)
     variance = np.maximum(np.mean(residual**2, axis=0), np.finfo(float).tiny)
     weighted = (slopes / np.sqrt(variance)[:, None]).reshape(-1, slopes.shape[2])
-    share = len(rows) / len(data)
     return _Forces(force, jacobian, Information(weighted.T @ weighted / share).covariance)
 
 

@@ -8,8 +8,9 @@ In the mean over the equations of motion:
 An equation without input is homogeneous: against a fixed scale a model could shrink it until nothing is left
 to explain; against its own size it cannot. Both are free of units. The objective is the loss + λ‖θ‖².
 
-Rows are samples of the inverse model (17), or the equations against test functions (`Weak`). Their Jacobian is reduced to a triangle chunk by chunk (QR of what
-was there and what comes), so that no sum of squares loses half of the digits and no large array is kept.
+Rows are samples of the inverse model (17), or the equations against test functions (`tested.Weak`). Their
+Jacobian is reduced to a triangle chunk by chunk (QR of what was there and what comes), so that no sum of
+squares loses half of the digits and no large array is kept.
 """
 
 from __future__ import annotations
@@ -18,12 +19,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from exlinn_fmi.learn.adjoint import Adjoint
+from exlinn_fmi.learn.adjoint import Adjoint, Upstream
 from exlinn_fmi.learn.assembly import Assembly
 from exlinn_fmi.learn.levenberg import Triangle, triangle
 from exlinn_fmi.learn.networks import StructuredNetworks
@@ -38,6 +40,17 @@ SLICE = 512
 """Samples whose gradient is made at once: they fit into the cache."""
 
 
+@runtime_checkable
+class Reverse(Protocol):
+    """Derivatives of what is made of rows, without a Jacobian, as `Adjoint` gives them."""
+
+    def forces(self, theta: Float[Array, " P"]) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
+        """The residual and the inertial forces in it."""
+
+    def gradient(self, theta: Float[Array, " P"], upstream: Upstream) -> Float[Array, " P"]:
+        """Derivatives by θ of what `upstream` has the derivatives of by residual and inertial forces."""
+
+
 class Rows(ABC):
     """Rows of the equations of motion for θ; N rows of n equations, dimensionless."""
 
@@ -47,6 +60,10 @@ class Rows(ABC):
     @abstractmethod
     def target(self) -> Float[Array, "N n"]:
         """Forces."""
+
+    @abstractmethod
+    def of(self, networks: StructuredNetworks) -> Rows:
+        """The same for other weights θ of the model."""
 
     @abstractmethod
     def thin(self, most: int) -> Rows:
@@ -65,7 +82,7 @@ class Rows(ABC):
         """Parts whose Jacobian is small."""
 
     @abstractmethod
-    def adjoints(self) -> Iterator[Adjoint]:
+    def adjoints(self) -> Iterator[Reverse]:
         """Parts whose gradient is made at once."""
 
     @abstractmethod
@@ -103,6 +120,10 @@ class Inverse(Rows):
     def target(self) -> Float[Array, "N n"]:
         """Forces."""
         return self.data.target
+
+    def of(self, networks: StructuredNetworks) -> Inverse:
+        """The same for other weights θ of the model."""
+        return Inverse(networks, self.data)
 
     def thin(self, most: int) -> Inverse:
         """Every k-th sample."""
@@ -180,7 +201,7 @@ class Objective:
         return loss(self.rows, theta) + self.regularisation * float(theta @ theta)
 
     @cached_property
-    def _adjoints(self) -> list[Adjoint]:
+    def _adjoints(self) -> list[Reverse]:
         return list(self.rows.adjoints())
 
     def gradient(self, theta: Float[Array, " P"]) -> tuple[float, Float[Array, " P"]]:

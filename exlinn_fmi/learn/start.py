@@ -131,9 +131,7 @@ def linear_start(rows: Rows, seed: int) -> Start:
     return Start(weights, tuple(epsilon.tolist()))
 
 
-def hidden_starts(
-    rows: Rows, weights: dict[str, Array]
-) -> Iterator[dict[str, Array]]:
+def hidden_starts(rows: Rows, weights: dict[str, Array]) -> Iterator[dict[str, Array]]:
     """Weights to start from with hidden units that take part from the first: better, or far too rich.
 
     The more singular values a solve keeps, the closer it is to clean data and the further off on others.

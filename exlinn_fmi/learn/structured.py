@@ -137,8 +137,8 @@ def iterate_structured(
         "noise": relative_noise(train),
         "optimiser": optimiser(options, networks.size)[1],
     }
-    parts = (equations(networks, part, objective) for part in (train, validation))
-    stages = _descend(*parts, start, options)
+    data, held = (equations(networks, part, objective) for part in (train, validation))
+    stages = _descend(data, held, start, options)
     for now, _ in zip(stages, range(options.iterations + 1), strict=False):
         for stage in {now.stage, "any"}:
             if stage not in best or now.rank < best[stage].rank:
@@ -186,7 +186,7 @@ def choose(objective: Goal, data: Dataset, loss: float = 0.0) -> tuple[Goal, str
 def equations(networks: StructuredNetworks, data: Dataset, objective: Goal) -> Rows:
     """What the first stages make small: the equations against test functions, or at the samples."""
     if objective == "weak":
-        return Weak.of(networks, data)
+        return Weak.all(networks, data)
     return Inverse(networks, inverse_assembly(networks.spec, data.arrays))
 
 
@@ -209,7 +209,7 @@ def _descend(data: Rows, held: Rows, start: Start, options: Structured) -> Itera
                 theta = best
         # Units that do not take part yet are silent; each starts from where it was drawn when it joins.
         part = StructuredNetworks(spec, chosen)
-        rows, judge = (replace(x, networks=part) for x in (data if stage == "all" else coarse, held))
+        rows, judge = (x.of(part) for x in (data if stage == "all" else coarse, held))
         objective = Objective(rows, options.regularisation)
         losses: list[float] = []
         if first_order and chosen.all():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset, Samples
+from exlinn_fmi.learn.adjoint import Adjoint, Upstream
 from exlinn_fmi.learn.assembly import Assembly, weak_assembly
 from exlinn_fmi.learn.networks import StructuredNetworks
 from exlinn_fmi.learn.noise import noise_levels
@@ -54,13 +55,17 @@ class Weak(Rows):
     windows: Windows
 
     @classmethod
-    def of(cls, networks: StructuredNetworks, data: Dataset) -> Weak:
+    def all(cls, networks: StructuredNetworks, data: Dataset) -> Weak:
         """All windows of the data, or `MOST`.
 
         Raises:
             DataError: no trajectory is long enough for a single window.
         """
         return cls(networks, data, windows(data)).thin(MOST)
+
+    def of(self, networks: StructuredNetworks) -> Weak:
+        """The same for other weights θ of the model."""
+        return Weak(networks, self.data, self.windows)
 
     @cached_property
     def target(self) -> Float[Array, "N n"]:
@@ -118,6 +123,10 @@ class Weak(Rows):
         """All: a window is a sum over many samples, and there are few of them."""
         yield self
 
+    def adjoints(self) -> Iterator[_Adjoint]:
+        """One for all."""
+        yield _Adjoint(self)
+
     def residual(self, theta: Float[Array, " P"]) -> Float[Array, "N n"]:
         """Equations less forces."""
         return self._sum(lambda at: self.networks.residual(theta, at), self._pieces) - self.target
@@ -146,8 +155,42 @@ class Weak(Rows):
         return both[..., 0], both[..., 1:]
 
 
+@dataclass(frozen=True)
+class _Adjoint:
+    """`adjoint.Adjoint` for windows: derivatives go back through their sums to the samples."""
+
+    rows: Weak
+
+    @cached_property
+    def _parts(self) -> list[tuple[Adjoint, _Piece]]:
+        return [(Adjoint(self.rows.networks, piece.samples), piece) for piece in self.rows._pieces]
+
+    def forces(self, theta: Float[Array, " P"]) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
+        """The residual and the inertial forces in it."""
+        residual, inertia = -self.rows.target, np.zeros_like(self.rows.target)
+        for one, piece in self._parts:
+            r, x = one.forces(theta)
+            residual[piece.windows] += piece.weights @ r
+            inertia[piece.windows] += piece.weights @ x
+        return residual, inertia
+
+    def gradient(self, theta: Float[Array, " P"], upstream: Upstream) -> Float[Array, " P"]:
+        """Derivatives by θ of what `upstream` has the derivatives of by residual and inertial forces."""
+        by_residual, by_inertia = upstream(*self.forces(theta))
+        total = np.zeros_like(theta)
+        for one, piece in self._parts:
+            back = [piece.weights.T @ by[piece.windows] for by in (by_residual, by_inertia)]
+            total += one.gradient(theta, partial(_given, back[0], back[1]))
+        return total
+
+
+def _given(by_residual: Array, by_inertia: Array, *_: Array) -> tuple[Array, Array]:
+    """`Upstream` of derivatives that are known already."""
+    return by_residual, by_inertia
+
+
 def usual_accelerations(data: Dataset) -> Float[Array, "N n"]:
-    """Root mean square of each acceleration, in all rows, from differences of velocities that exceed noise."""
+    """Root mean square of each acceleration, from differences of velocities that exceed their noise."""
     names = [c.velocity for c in data.coordinates]
     time, v = data.frame["time"].to_numpy(dtype=float), data.frame[names].to_numpy(dtype=float)
     trajectory, noise = data.frame["trajectory"].to_numpy(), noise_levels(data)[-len(names) :]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -74,6 +75,13 @@ class Windows:
     def __len__(self) -> int:
         return len(self.first)
 
+    @property
+    def overlap(self) -> float:
+        """How many windows hold a row, in the mean over those that any holds."""
+        ends = np.maximum.accumulate(self.end)
+        held = self.end - np.maximum(self.first, np.concatenate([[0], ends[:-1]]))
+        return float((self.end - self.first).sum() / held.sum())
+
     def thin(self, most: int) -> Windows:
         """At most so many of them, evenly."""
         kept = slice(None, None, -(-len(self) // most))
@@ -122,7 +130,7 @@ def windows(data: Dataset) -> Windows:
         )
     most = max(min(LONGEST, longest // WINDOWS, longest - 1) // 2, 2)
     firsts, lengths = [], []
-    for begin, end in zip(begins[:-1], begins[1:], strict=True):
+    for begin, end in pairwise(begins.tolist()):
         half = most if 2 * most < end - begin else (end - begin - 1) // 4
         if half < max(most // OVERLAP, 2):
             continue  # derivatives of test functions grow as windows become short, and noise with them

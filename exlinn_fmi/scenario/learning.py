@@ -278,9 +278,8 @@ class Learn(Spec):
     objective: Objective = Field(
         "auto",
         description="what `structured`, `terms` and `identify` make small: `inverse`: errors of forces, "
-        "which takes accelerations; `weak` (`terms` alone): those against test functions, without "
-        "accelerations; `trajectory`: errors of predicted states, best under noise; `auto`: as the noise "
-        "calls for",
+        "which takes accelerations; `weak`: those against test functions, without accelerations; "
+        "`trajectory`: errors of predicted states, best under noise; `auto`: as the noise calls for",
     )
     energies: EnergiesSpec = Field(
         default_factory=lambda: EnergiesSpec(), description="energies that the plant has, as far as known"

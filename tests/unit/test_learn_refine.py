@@ -9,7 +9,6 @@ import pytest
 from learn_helpers import MOTOR_CART, motor_cart, motor_cart_dataset, random_model
 
 from exlinn_fmi.data.dataset import Dataset, split
-from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.networks import StructuredNetworks
 from exlinn_fmi.learn.rollout import free_run, nrmse
 from exlinn_fmi.learn.structured import choose
@@ -64,8 +63,9 @@ def test_the_scenario_has_the_last_word() -> None:
     model = learned("inverse")
     assert model.provenance["objective"] == "inverse: as the scenario says"
     assert not model.history["stage"].str.contains("trajectory").any()
-    with pytest.raises(TrainingError, match="'weak' takes the preset 'terms'"):
-        train(*split(noisy(0.02), 0.8, 10, 0), OPTIONS, 0, objective="weak")
+    model = learned("weak")
+    assert model.provenance["objective"] == "weak: as the scenario says"
+    assert not model.history["stage"].str.contains("trajectory").any()
 
 
 def test_clean_looking_states_that_do_not_fit_the_accelerations_are_told_of() -> None:
