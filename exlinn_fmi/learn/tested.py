@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 
 MOST = 5000
 """Windows that are looked at."""
+BESIDE = 24
+"""So many fit into the longest trajectory: weights ask for more equations than a few terms do."""
 BEYOND = 3.0
 """Changes of velocities whose square exceeds that of noise so many times tell of accelerations."""
 
@@ -61,7 +63,7 @@ class Weak(Rows):
         Raises:
             DataError: no trajectory is long enough for a single window.
         """
-        return cls(networks, data, windows(data)).thin(MOST)
+        return cls(networks, data, windows(data, BESIDE)).thin(MOST)
 
     def of(self, networks: StructuredNetworks) -> Weak:
         """The same for other weights θ of the model."""

@@ -111,11 +111,12 @@ class Windows:
             yield Piece(rows, some, BUMP(now) * step, SLOPE(now) * step / half[some], held)
 
 
-def windows(data: Dataset) -> Windows:
+def windows(data: Dataset, beside: int = WINDOWS) -> Windows:
     """Windows in all trajectories, as long as the longest one asks for, shorter in those that are shorter.
 
     Args:
         data: trajectories.
+        beside: so many fit into the longest one beside one another.
 
     Raises:
         DataError: no trajectory is long enough for a single window.
@@ -128,7 +129,7 @@ def windows(data: Dataset) -> Windows:
             f"data set: the longest trajectory has {longest} rows, expected at least {SHORTEST} for the "
             "objective 'weak'; record for longer, or choose 'inverse'"
         )
-    most = max(min(LONGEST, longest // WINDOWS, longest - 1) // 2, 2)
+    most = max(min(LONGEST, longest // beside, longest - 1) // 2, 2)
     firsts, lengths = [], []
     for begin, end in pairwise(begins.tolist()):
         half = most if 2 * most < end - begin else (end - begin - 1) // 4
