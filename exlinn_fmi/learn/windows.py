@@ -31,6 +31,8 @@ WINDOWS = 6
 """… unless that many windows do not fit into the longest trajectory beside one another."""
 OVERLAP = 16
 """Windows begin a 16th of their length apart."""
+LEAST = 150
+"""More windows than that many ask for this many rows in each: over fewer, sums are poor integrals."""
 SHORTEST = 5
 """Rows that a window has at least."""
 PIECE = 512
@@ -116,7 +118,7 @@ def windows(data: Dataset, beside: int = WINDOWS) -> Windows:
 
     Args:
         data: trajectories.
-        beside: so many fit into the longest one beside one another.
+        beside: so many fit into the longest one beside one another, where each has `LEAST` rows.
 
     Raises:
         DataError: no trajectory is long enough for a single window.
@@ -129,7 +131,7 @@ def windows(data: Dataset, beside: int = WINDOWS) -> Windows:
             f"data set: the longest trajectory has {longest} rows, expected at least {SHORTEST} for the "
             "objective 'weak'; record for longer, or choose 'inverse'"
         )
-    most = max(min(LONGEST, longest // beside, longest - 1) // 2, 2)
+    most = max(min(LONGEST, longest // WINDOWS, max(longest // beside, LEAST)) // 2, 2)
     firsts, lengths = [], []
     for begin, end in pairwise(begins.tolist()):
         half = most if 2 * most < end - begin else (end - begin - 1) // 4
