@@ -30,6 +30,7 @@ from exlinn_fmi.learn.objective import Inverse, Objective, Rows, loss
 from exlinn_fmi.learn.refine import FLOOR, SWEEPS, Candidate, refine
 from exlinn_fmi.learn.start import Start, hidden_starts, linear_start
 from exlinn_fmi.learn.tested import Weak, usual_accelerations
+from exlinn_fmi.learn.windows import SHORTEST
 from exlinn_fmi.mechanics.learned import ModelSpec
 from exlinn_fmi.mechanics.structure import UNKNOWN, Structure
 from exlinn_fmi.scenario.learning import Objective as Goal
@@ -70,7 +71,7 @@ def structured_spec(
         options: the learner's settings.
         seed: of what is drawn.
         structure: what is known of the plant.
-        objective: what is made small.
+        objective: what is made small first, see `begin`.
 
     Raises:
         DataError: the objective is `weak` and no trajectory is long enough for it.
@@ -137,7 +138,8 @@ def iterate_structured(
         "noise": relative_noise(train),
         "optimiser": optimiser(options, networks.size)[1],
     }
-    data, held = (equations(networks, part, objective) for part in (train, validation))
+    first = begin(objective, train, validation)
+    data, held = (equations(networks, part, first) for part in (train, validation))
     stages = _descend(data, held, start, options)
     for now, _ in zip(stages, range(options.iterations + 1), strict=False):
         for stage in {now.stage, "any"}:
@@ -146,6 +148,7 @@ def iterate_structured(
         yield replace(now, notes=notes)
     chosen, notes["objective"] = choose(objective, train, best["any"].loss)
     if chosen == "trajectory":
+        notes["objective"] += f"; from a start by {first!r}"
         direct, full = (networks.pack(best[stage].weights) for stage in ("direct", "any"))
         mask, large = networks.pack_mask(spec.layout.direct), networks.size > LARGE
         if large:
@@ -159,6 +162,21 @@ def iterate_structured(
             Candidate("trajectory", full, mask if large else np.ones_like(mask)),
         )
         yield from refine(networks, candidates, train, validation, notes)
+
+
+def begin(objective: Goal, train: Dataset, validation: Dataset) -> Goal:
+    """What the first stages make small: noise is averaged by the weak form, and grows in accelerations.
+
+    Args:
+        objective: what the user chose.
+        train: data to fit.
+        validation: data to watch.
+    """
+    if objective == "weak":
+        return objective
+    longest = min(int(data.frame.groupby("trajectory").size().max()) for data in (train, validation))
+    noisy = max(relative_noise(train).values()) > CLEAN and longest >= SHORTEST
+    return "weak" if noisy and choose(objective, train)[0] == "trajectory" else "inverse"
 
 
 def choose(objective: Goal, data: Dataset, loss: float = 0.0) -> tuple[Goal, str]:

@@ -187,9 +187,9 @@ def _learner(
 
         spec = terms_spec(train, method, structure)
         return spec, iterate_terms(spec, train, validation, objective, method), STAGES
-    from exlinn_fmi.learn.structured import iterate_structured, most_iterations, structured_spec
+    from exlinn_fmi.learn.structured import begin, iterate_structured, most_iterations, structured_spec
 
-    spec, start = structured_spec(train, method, seed, structure, objective)
+    spec, start = structured_spec(train, method, seed, structure, begin(objective, train, validation))
     unknowns = sum(int(mask.sum()) for mask in spec.layout.free.values())
     if len(train) * len(train.coordinates) < unknowns:
         raise DataError(

@@ -6,12 +6,19 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from learn_helpers import MOTOR_CART, motor_cart, motor_cart_dataset, random_model
+from learn_helpers import (
+    MOTOR_CART,
+    SOLENOID,
+    motor_cart,
+    motor_cart_dataset,
+    random_model,
+    solenoid_dataset,
+)
 
 from exlinn_fmi.data.dataset import Dataset, split
 from exlinn_fmi.learn.networks import StructuredNetworks
 from exlinn_fmi.learn.rollout import free_run, nrmse
-from exlinn_fmi.learn.structured import choose
+from exlinn_fmi.learn.structured import begin, choose
 from exlinn_fmi.learn.train import TrainedModel, train
 from exlinn_fmi.learn.trajectory import Shooting, cut
 from exlinn_fmi.scenario.learning import Objective, Structured
@@ -46,6 +53,25 @@ def test_noise_makes_auto_go_on_to_trajectories_and_the_model_better() -> None:
     assert list(dict.fromkeys(model.history["stage"]))[-1].startswith("trajectory")
     assert "noise, the most of all states" in model.provenance["objective"]
     assert rollout(model) < rollout(learned("inverse")) / 1.5
+
+
+def test_noise_is_begun_with_by_the_weak_form() -> None:
+    assert learned("auto").provenance["objective"].endswith("; from a start by 'weak'")
+    exact, short = motor_cart_dataset(1.0), noisy(0.02).select([0])
+    assert begin("auto", exact, exact) == begin("trajectory", exact, exact) == "inverse"
+    assert begin("auto", short, Dataset(short.frame[:4], MOTOR_CART)) == "inverse"  # no window to judge by
+    assert begin("inverse", short, short) == "inverse"
+
+
+def test_a_noisy_solenoid_is_learned_from_there() -> None:
+    frame, random = solenoid_dataset().frame, np.random.default_rng(0)
+    states = ["x", "x_dot", "i"]
+    frame[states] += 0.01 * frame[states].std().to_numpy() * random.standard_normal((len(frame), 3))
+    columns = {name: frame[name] for name in ("time", "trajectory", *states, "v")}
+    options = Structured(preset="structured", iterations=100)
+    model = train(*split(Dataset.from_columns(columns, SOLENOID), 0.8, 10, 0), options, 0)
+    test = solenoid_dataset(seed=7)
+    assert max(nrmse(model.system, test, free_run(model.system, test), 2.0).values()) < 0.02
 
 
 def test_the_losses_are_those_of_noise() -> None:
