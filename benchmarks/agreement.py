@@ -132,9 +132,10 @@ def agree(quick: bool) -> dict[str, float]:
     ipopt = Peer("ipopt", lambda x0, aim, _: solved(make_solver(ocp, "ipopt", 300, 1e-9).solve(x0, aim)))
     others = []
     if os.environ.get("ACADOS_SOURCE_DIR"):
-        from baselines.acados import Acados
+        from baselines.acados import SeparateAcados
 
-        others.append(Peer("acados", Acados(ocp, "SQP").converged))
+        acados = SeparateAcados()
+        others.append(Peer("acados", lambda x0, aim, targets: acados.converged(ocp, x0, aim, targets)))
     for k in range(count):
         x0 = rng.uniform([0.2, -5.0, -4.5], [2.9, 5.0, 4.5])
         draw(ours, rng)

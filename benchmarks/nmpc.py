@@ -168,12 +168,13 @@ def peers(given: Problem, loop: Loop) -> Iterator[tuple[str, NDArray[np.float64]
 
         yield "dompc", DoMpc(given.ocp).times(loop.states, loop.aims)
     if os.environ.get("ACADOS_SOURCE_DIR"):
-        from baselines.acados import Acados
+        from baselines.acados import SeparateAcados
 
-        step, feedback = Acados(given.ocp, "SQP_RTI").times(loop.states, loop.aims)
+        acados = SeparateAcados()
+        step, feedback = acados.times(True, loop.states, loop.aims)
         yield "acados", step
         yield "acados_feedback", feedback
-        yield "acados_default", Acados(given.ocp, "SQP_RTI", tuned=False).times(loop.states, loop.aims)[0]
+        yield "acados_default", acados.times(False, loop.states, loop.aims)[0]
 
 
 def cold(quick: bool) -> Figures:

@@ -1,13 +1,19 @@
 """The same optimal control problem in acados with HPIPM: for machines that have it.
 
 It is used where ACADOS_SOURCE_DIR says that acados is installed, with its Python package `acados_template`.
+It runs in a process of its own: its HPIPM and the one that comes with CasADi have the same file names, and
+whichever is found first would serve both.
 """
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import tempfile
 import time
 import warnings
+from concurrent.futures import ProcessPoolExecutor
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +21,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from baselines.cart import problem
 from exlinn_fmi.control.ocp import Ocp, Targets
 from exlinn_fmi.control.reference import References
 from exlinn_fmi.control.solver import Plan
@@ -142,3 +149,57 @@ class Acados:
         solver.set(0, "lbx", x0)
         solver.set(0, "ubx", x0)
         return self._plan() if solver.solve() == 0 else None
+
+
+@lru_cache
+def _solver(method: Literal["SQP_RTI", "SQP"], tuned: bool) -> Acados:
+    return Acados(problem.__wrapped__().ocp, method, tuned)
+
+
+def _times(
+    tuned: bool, states: NDArray[np.float64], aims: list[References]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return _solver("SQP_RTI", tuned).times(states, aims)
+
+
+def _converged(
+    drawn: dict[str, NDArray[np.float64]], x0: NDArray[np.float64], aim: References, targets: Targets
+) -> Plan | None:
+    made = _solver("SQP", True)
+    ocp = made._ocp
+    for name, value in drawn.items():
+        getattr(ocp if name == "R" else ocp.limits, name)[:] = value
+    return made.converged(x0, aim, targets)
+
+
+class SeparateAcados:
+    """acados on the cart's problem, in a process of its own.
+
+    Raises:
+        RuntimeError: its libraries are in this process's search path too.
+    """
+
+    def __init__(self) -> None:
+        folder = str(Path(os.environ["ACADOS_SOURCE_DIR"]) / "lib")
+        before = os.environ.get("LD_LIBRARY_PATH", "")
+        if folder in before.split(":"):
+            raise RuntimeError(
+                "LD_LIBRARY_PATH: take acados out (ACADOS_SOURCE_DIR does), else CasADi uses its HPIPM"
+            )
+        self._pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+        os.environ["LD_LIBRARY_PATH"] = folder
+        self._pool.submit(os.getpid).result()  # by now it is started
+        os.environ["LD_LIBRARY_PATH"] = before
+
+    def times(
+        self, tuned: bool, states: NDArray[np.float64], aims: list[References]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """As `Acados.times`, of the problem as it is."""
+        return self._pool.submit(_times, tuned, states, aims).result()
+
+    def converged(self, ocp: Ocp, x0: NDArray[np.float64], aim: References, targets: Targets) -> Plan | None:
+        """As `Acados.converged`, under the bounds and weights of `ocp`."""
+        drawn = {name: getattr(ocp.limits, name) for name in ("u_min", "u_max", "x_min", "x_max")} | {
+            "R": ocp.R
+        }
+        return self._pool.submit(_converged, drawn, x0, aim, targets).result()
