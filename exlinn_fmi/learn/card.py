@@ -19,7 +19,7 @@ from exlinn_fmi.learn.curves import curves
 from exlinn_fmi.learn.estimate import estimate
 from exlinn_fmi.learn.guarantee import told
 from exlinn_fmi.learn.identify import Identified, identify
-from exlinn_fmi.learn.noise import CLEAN, relative_noise
+from exlinn_fmi.learn.noise import relative_noise
 from exlinn_fmi.learn.rollout import free_run, nrmse
 from exlinn_fmi.learn.terms import formula, term_table
 from exlinn_fmi.learn.train import TrainedModel
@@ -92,8 +92,9 @@ def report_card(
     noise = relative_noise(train)
     metrics |= {f"learn.noise_{name}": value for name, value in noise.items()}
     found, texts = None, {"learn.guarantee": told(system, train)}
-    if options.names and (objective != "auto" or max(noise.values()) > CLEAN):
-        found, texts["identify.objective"] = estimate(train, options, truth, objective)
+    if options.names:
+        found, note = estimate(train, options, truth, objective)
+        texts |= {"identify.objective": note} if note else {}
     found = found or identify(system, train, options, truth)
     terms = None
     if model.spec.form == "terms":

@@ -20,7 +20,7 @@ from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.discover import spread, start
 from exlinn_fmi.learn.identify import Identified, Unknowns, parameter_table
 from exlinn_fmi.learn.noise import CLEAN
-from exlinn_fmi.learn.terms import choose, linear_fit, regress
+from exlinn_fmi.learn.terms import choose, linear_fit, regress, unexplained
 from exlinn_fmi.learn.trajectory import Fit, cut, maximum_likelihood
 from exlinn_fmi.learn.weak import inverse_regression
 from exlinn_fmi.scenario.learning import Identify, Objective
@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 
 EXPLAINED = 1.5
 """Residuals that exceed the estimated noise by no more than this factor are explained."""
+FILTERED = 1e-3
+"""States look clean to the eye for white noise; a larger share of forces that do not fit tells of another."""
 CONFIDENCE = 1.96
 """Standard deviations on either side of a 95 % interval."""
 
@@ -38,7 +40,7 @@ class Estimate(NamedTuple):
 
     Args:
         identified: the table with columns std, low and high; None where there is no estimate.
-        note: what was done and why, and what the data cannot tell apart.
+        note: what was done and why, and what the data cannot tell apart; empty where data are clean.
     """
 
     identified: Identified | None
@@ -60,6 +62,15 @@ def estimate(data: Dataset, options: Identify, truth: Mapping[str, float], objec
     unknowns = Unknowns.of(data.coordinates, options)
     basis, known = unknowns.basis, unknowns.known
     chosen, why = choose(objective, basis, data, known)
+    if objective == "auto" and chosen == "inverse":
+        share = unexplained(inverse_regression, basis, data, known)
+        if share < FILTERED:
+            return Estimate(None, "")
+        chosen = "trajectory"
+        why = (
+            f"trajectory: states look clean, but {100 * share:.2g} % of forces do not fit the accelerations, "
+            "as when noise was filtered"
+        )
     if chosen == "trajectory":
         system, free = basis.system().bound(known), np.isnan(known)
         segments = cut(data, system.state_names, system.input_names)
@@ -71,10 +82,12 @@ def estimate(data: Dataset, options: Identify, truth: Mapping[str, float], objec
             return Estimate(None, "read off the learned model: the monomials alone predict nothing")
         size = data.frame[system.state_names].std().to_numpy()
         excess = float((fit.sigma / np.maximum(segments.sigma, CLEAN * size)).max())
-        if not excess <= EXPLAINED:
+        # The estimate takes the noise for white: what was filtered is more, but forgets itself soon.
+        if not (excess <= EXPLAINED or fit.is_noise):
             reason = f"the monomials leave residuals of {excess:.3g} times the noise"
             return Estimate(None, f"read off the learned model: {reason}")
         misfit = float((fit.sigma / size).max())
+        why += f"; {fit.information}"
         regression = inverse_regression(basis, data, fit.p)
     else:
         make, windows = regress(basis, data, chosen)

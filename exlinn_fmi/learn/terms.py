@@ -96,9 +96,9 @@ def choose(
             "trajectory",
             f"trajectory: {worst} has {100 * noise[worst]:.2g} % noise, the most of all states",
         )
-    misfit = _misfit(inverse_regression, basis, data, known)
+    misfit = unexplained(inverse_regression, basis, data, known)
     # Where not even the weak form fits it is the terms that fall short: no objective mends that.
-    if misfit > CONSISTENT and _misfit(weak_regression, basis, data, known) < RESOLVED:
+    if misfit > CONSISTENT and unexplained(weak_regression, basis, data, known) < RESOLVED:
         return "trajectory", _doubt(misfit)
     return "inverse", "inverse: the states are clean and the accelerations do not contradict them"
 
@@ -107,13 +107,20 @@ def _doubt(misfit: float) -> str:
     return f"trajectory: states are clean, but {100 * misfit:.2g} % of forces do not fit the accelerations"
 
 
-def _misfit(
+def unexplained(
     kind: Callable[..., Regression],
     basis: MonomialBasis,
     data: Dataset,
     known: Float[Array, " P"] | None,
 ) -> float:
-    """What the best of a family leaves unexplained."""
+    """What the best of a family leaves unexplained, as a share of the forces.
+
+    Args:
+        kind: `inverse_regression` or `weak_regression`.
+        basis: the family.
+        data: what it is fitted to.
+        known: parameters that are held, NaN for the others.
+    """
     p = solve(partial(kind, basis, data), basis.start, known)
     return kind(basis, data, p).misfit(p)
 
@@ -302,7 +309,8 @@ def _notes(basis: MonomialBasis, found: Discovery, why: str, data: Dataset) -> d
     """Provenance: the objective and its reason, noise, and the terms with their deviations."""
     if found.fit.sigma.size:  # of states, as the residuals of trajectories show it
         excess = float((found.fit.sigma / np.maximum(noise_levels(data), CLEAN * _size(data))).max())
-        if excess > BEYOND:
+        why += f"; {found.fit.information}"
+        if excess > BEYOND and not found.fit.is_noise:
             why += f"; they leave residuals of {excess:.3g} times the noise: {NO_FORMULA}"
     elif (misfit := np.sqrt(force_misfit(found.basis, found.p, data))) > SHORT:
         why += f"; they leave {100 * misfit:.2g} % of the forces unexplained: {NO_FORMULA}"

@@ -4,7 +4,8 @@ Each trajectory is cut into segments; unknown are the parameters p and the first
 residuals are the measured less the predicted states over their noise σ, and the gaps between segments over a
 thousandth of σ: so the trajectory is continuous, and still the problem is one sum of squares without
 constraints, well conditioned for unstable systems too. Levenberg–Marquardt solves it with sensitivities
-through RK4; with residual-based σ its Gauss–Newton matrix gives the covariance of p.
+through RK4; with residual-based σ its Gauss–Newton matrix gives the covariance of p, and the correlation of
+the residuals widens it where noise is not white (`colour`).
 
 References: Bock (1983), Recent advances in parameter identification for ODE (multiple shooting);
     Ljung (1999), System Identification, ch. 9 (covariance of prediction-error estimates).
@@ -23,6 +24,7 @@ from scipy.linalg import block_diag
 
 from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.errors import DataError, TrainingError
+from exlinn_fmi.learn.colour import colour, spread_of
 from exlinn_fmi.learn.levenberg import Normal, levenberg_marquardt
 from exlinn_fmi.learn.motion import NetworkMotion
 from exlinn_fmi.learn.networks import StructuredNetworks
@@ -129,9 +131,15 @@ SINGULAR = 1e-12
 
 @dataclass(frozen=True)
 class Information:
-    """What the data tell of p: the Gauss–Newton matrix, the segments' states eliminated."""
+    """What the data tell of p.
+
+    Args:
+        matrix: the Gauss–Newton matrix, the segments' states eliminated.
+        spread: covariance of the gradient where noise is not white; else it is that matrix, too.
+    """
 
     matrix: Float[Array, "P P"]
+    spread: Float[Array, "P P"] | None = None
 
     @cached_property
     def _scaled(self) -> tuple[Array, Array, Array]:
@@ -145,8 +153,25 @@ class Information:
         values, vectors, size = self._scaled
         kept = values > SINGULAR * values.max()
         inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
+        if self.spread is not None:
+            inverse = inverse @ (self.spread / size[:, None] / size) @ inverse
         with np.errstate(over="ignore"):  # what the data say nothing of has no finite variance
             return np.asarray(inverse / size[:, None] / size)
+
+    @property
+    def widening(self) -> float:
+        """By how much correlated noise widens the intervals, in the geometric mean."""
+        white, found = np.diag(Information(self.matrix).covariance), np.diag(self.covariance)
+        told = (white > 0) & np.isfinite(white)
+        return float(np.exp(np.mean(np.log(found[told] / white[told])) / 2)) if told.any() else 1.0
+
+    def __str__(self) -> str:
+        if self.spread is None:
+            return "the noise is white"
+        return (
+            "the noise is correlated from row to row, so that intervals are "
+            f"{self.widening:.2g} times as wide as under white noise"
+        )
 
     @property
     def unknown(self) -> Float[Array, "D P"]:
@@ -156,7 +181,8 @@ class Information:
 
     def only(self, chosen: NDArray[np.bool_]) -> Information:
         """Where the other parameters are known."""
-        return Information(self.matrix[np.ix_(chosen, chosen)])
+        block = np.ix_(chosen, chosen)
+        return Information(self.matrix[block], None if self.spread is None else self.spread[block])
 
 
 class Fit(NamedTuple):
@@ -168,6 +194,8 @@ class Fit(NamedTuple):
         value: sum of squared residuals over their σ.
         information: what the data tell of p.
         sigma: noise of each state as the residuals show it.
+        memory: rows over which that noise stays alike, 1 where it is white.
+        pace: rows that the motion takes to change by its standard deviation, that of the fastest state.
     """
 
     p: Float[Array, " P"]
@@ -175,6 +203,13 @@ class Fit(NamedTuple):
     value: float
     information: Information
     sigma: Float[Array, " nx"]
+    memory: float = 1.0
+    pace: float = np.inf
+
+    @property
+    def is_noise(self) -> bool:
+        """Whether the residuals may be noise: what a model does not explain changes no faster than motion."""
+        return self.memory < self.pace
 
 
 @dataclass(frozen=True)
@@ -276,7 +311,11 @@ class Shooting:
         return Normal(float(np.sum(rest**2) + np.sum(gaps**2) + np.sum(self.prior * p**2)), gradient, matrix)
 
     def information(self, theta: Float[Array, " T"]) -> Information:
-        """What the data tell of p at θ."""
+        """What the data tell of p at θ, were the noise white."""
+        return self._eliminated(theta)[0]
+
+    def _eliminated(self, theta: Float[Array, " T"]) -> tuple[Information, Float[Array, "S P"]]:
+        """What the data tell of p, and by how much the segments' states move with p."""
         matrix, r = self.normal(theta).matrix, self._motion.size
         try:
             if not np.isfinite(matrix).all():
@@ -287,7 +326,33 @@ class Shooting:
                 "the fitted model says nothing of the measured states: its sensitivities vanish; check units "
                 "and columns of the data, or choose the objective 'inverse'"
             ) from error
-        return Information(matrix[:r, :r] - matrix[:r, r:] @ cross)
+        return Information(matrix[:r, :r] - matrix[:r, r:] @ cross), np.asarray(cross, dtype=float)
+
+    def correlated(self, theta: Float[Array, " T"]) -> tuple[Information, float]:
+        """What the data tell of p at θ with noise as the residuals show it, and its memory in rows."""
+        white, cross = self._eliminated(theta)
+        p, x = self.split(theta)[0], self.predict(theta)
+        (count, rows, nx), r = x.shape, len(p)
+        noise = colour(self._series(self.residuals(x)))
+        if not noise.order:
+            return white, 1.0
+        moved = cross.reshape(count, nx, r)
+        influence = np.empty((count, rows, nx, r))
+        for k, s in enumerate(self._motion.sensitivities(x, self.data.inputs, p)):
+            influence[:, k] = (s[:, :, nx:] - s[:, :, :nx] @ moved) / self.data.sigma[:, None]
+        return replace(white, spread=spread_of(noise, self._series(influence))), noise.memory
+
+    def _series(self, values: Float[Array, "B rows ..."]) -> list[Array]:
+        """What belongs to the rows that count, in the order of time, for each trajectory apart."""
+        ends = np.flatnonzero(self.data.follows < 0)[:-1] + 1
+        counted = np.split(self.data.counted > 0, ends)
+        return [part[rows] for part, rows in zip(np.split(values, ends), counted, strict=True)]
+
+    def pace(self, theta: Float[Array, " T"]) -> float:
+        """Rows that the motion takes to change by its standard deviation, that of the fastest state."""
+        series = self._series(self.predict(theta))
+        speed = np.sqrt(np.mean(np.concatenate([np.diff(part, axis=0) for part in series]) ** 2, axis=0))
+        return float(np.min(np.concatenate(series).std(axis=0) / np.maximum(speed, np.finfo(float).tiny)))
 
     def noise(self, theta: Float[Array, " T"]) -> Float[Array, " nx"]:
         """Noise of each state as the residuals show it, less what the fit has taken of them."""
@@ -315,7 +380,7 @@ def maximum_likelihood(
         p: start.
         states: where segments start; as measured if not given.
         iterations: most Levenberg–Marquardt iterations each time.
-        passes: how often; 1 keeps to the noise that was estimated.
+        passes: how often; 1 keeps to the noise that was estimated, and takes it for white.
     """
     for _ in range(passes):
         shooting = Shooting(system, data)
@@ -328,5 +393,6 @@ def maximum_likelihood(
                 break
         data = replace(data, sigma=shooting.noise(theta))
     shooting = Shooting(system, data)
-    information, value = shooting.information(theta), shooting.value(theta)
-    return Fit(p, shooting.split(theta)[1], value, information, data.sigma)
+    information, memory = shooting.correlated(theta) if passes > 1 else (shooting.information(theta), 1.0)
+    states, value = shooting.split(theta)[1], shooting.value(theta)
+    return Fit(p, states, value, information, data.sigma, memory, shooting.pace(theta))
