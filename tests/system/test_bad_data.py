@@ -108,7 +108,7 @@ BOTH = {
         r"mispredicts .* 'i' by \d+% of its movement within .* learned nothing; check the columns",
     ),
     "voltage not recorded as it was": Kind(
-        lambda f: f.assign(v=4.0), RUN, "<name>: 'v' is 4 in all rows; vary it.* it has learned nothing"
+        lambda f: f.assign(v=4.0), 0, r"mispredicts the data .*: 'i' by \d+% of its movement within"
     ),
     "input saturated": Kind(
         lambda f: f.assign(v=f["v"].clip(-24, 8)), 0, "'v' stays at its extreme, 8, for .* the input may be"
@@ -269,7 +269,7 @@ def test_what_a_plant_did_is_kept_where_nothing_can_be_learned_of_it(
 def test_without_a_model_there_is_nothing_to_design_with(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bad = scenario("plant", tmp_path, GOOD.assign(v=4.0))
+    bad = scenario("plant", tmp_path, BOTH["current and voltage swapped"].damage(GOOD))
     assert run(bad, capsys).code == RUN
     result = run(bad, capsys, "design")
     assert result.code == INPUT
