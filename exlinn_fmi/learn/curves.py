@@ -118,7 +118,7 @@ def _forces(model: TrainedModel, data: Dataset) -> _Forces:
         return networks.jacobian(theta, inverse_assembly(spec, samples))[1] * unit[:, None]
 
     rows: Rows
-    if model.provenance["objective"].startswith("weak"):
+    if model.provenance.get("objective", "").startswith("weak"):
         rows = Weak.all(networks, data)
         share = rows.windows.overlap  # windows that share their samples tell the same
     else:
