@@ -230,7 +230,8 @@ def _solve(
     size = np.linalg.norm(matrix, axis=0)
     size[size == 0] = 1
     count = int(places[-1])
-    r = triangle(np.column_stack([matrix / size, (target * weight).ravel()]))
+    few = np.zeros((max(len(size) + 1 - len(matrix), 0), len(size) + 1))  # fewer equations than unknowns
+    r = triangle(np.column_stack([matrix / size, (target * weight).ravel()]), few)
     left, singular, right = np.linalg.svd(r[:count, :count])
     n, part = target.shape[1], rows.samples(SAMPLES)
     values, slopes = family(part).mass

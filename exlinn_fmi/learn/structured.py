@@ -20,6 +20,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
+from exlinn_fmi.errors import DataError
 from exlinn_fmi.learn.assembly import data_scales, inverse_assembly
 from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.learn.lbfgs import lbfgs
@@ -74,7 +75,7 @@ def structured_spec(
         objective: what is made small first, see `begin`.
 
     Raises:
-        DataError: the objective is `weak` and no trajectory is long enough for it.
+        DataError: there are fewer equations than weights, or no trajectory is long enough for `weak`.
     """
     samples = train.arrays
     if objective == "weak":
@@ -84,6 +85,13 @@ def structured_spec(
     spec = ModelSpec(
         "structured", train.coordinates, options.hidden, scales, epsilon=(0.0,) * n, structure=structure
     )
+    unknowns = sum(int(mask.sum()) for mask in spec.layout.free.values())
+    if len(train) * n < unknowns:
+        raise DataError(
+            f"data set: {len(train)} rows to fit (without those that validate) give {len(train) * n} "
+            f"equations for {unknowns} weights, expected at least {-(-unknowns // n)} rows; record for "
+            "longer, lower `learn.method.hidden`, or choose the preset 'terms'"
+        )
     start = linear_start(equations(StructuredNetworks(spec), train, objective), seed)
     return replace(spec, epsilon=start.epsilon), start
 

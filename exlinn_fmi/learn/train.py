@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset, required_columns
 from exlinn_fmi.data.doubts import audit
-from exlinn_fmi.errors import DataError, TrainingError
+from exlinn_fmi.errors import TrainingError
 from exlinn_fmi.learn.iterate import Iterate
 from exlinn_fmi.learn.verdict import NOTHING, POOR, judge
 from exlinn_fmi.mechanics.coordinates import input_names, state_names
@@ -190,14 +190,6 @@ def _learner(
     from exlinn_fmi.learn.structured import begin, iterate_structured, most_iterations, structured_spec
 
     spec, start = structured_spec(train, method, seed, structure, begin(objective, train, validation))
-    unknowns = sum(int(mask.sum()) for mask in spec.layout.free.values())
-    if len(train) * len(train.coordinates) < unknowns:
-        raise DataError(
-            f"data set: {len(train)} rows to fit (without those that validate) give "
-            f"{len(train) * len(train.coordinates)} equations for {unknowns} weights, expected at least "
-            f"{-(-unknowns // len(train.coordinates))} rows; record for longer, lower `learn.method.hidden`, "
-            "or choose the preset 'terms'"
-        )
     iterates = iterate_structured(spec, start, train, validation, method, objective)
     return spec, iterates, most_iterations(method, objective, train)
 

@@ -78,10 +78,8 @@ def test_a_capacitance_is_a_curve_of_the_distance() -> None:
 
 def test_a_model_without_covariance_has_curves_without_bands() -> None:
     features = ["alpha_dot^2", "i^2", "i*alpha"]
-    method = Paper(
-        preset="paper", lagrangian_features=features, dissipation_features=["i^2", "alpha_dot^2"], epochs=1
-    )
-    data = Dataset(clean().frame[:200], clean().coordinates)
+    method = Paper(preset="paper", lagrangian_features=features, dissipation_features=["i^2", "alpha_dot^2"])
+    data = clean()
     table = curves(train(data, data, method, 0), data)
     assert len(table)
     assert table["low"].isna().all()
