@@ -171,7 +171,7 @@ def test_short_trajectories_have_windows_of_their_own() -> None:
 
 
 def test_data_without_a_window_are_an_error() -> None:
-    frames = [motor_cart(seconds=1.0, trajectory=k).iloc[4 * k : 4 * k + 4] for k in range(10)]
+    frames = [motor_cart(seconds=1.0, trajectory=k).iloc[4 * k : 4 * k + 4] for k in range(20)]
     data = Dataset(pd.concat(frames), MOTOR_CART)
     with pytest.raises(DataError, match="the longest trajectory has 4 rows, expected at least 5"):
         train(data, data, OPTIONS, 0, objective="weak")
