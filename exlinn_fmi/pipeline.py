@@ -67,7 +67,7 @@ def collect(work: Run) -> Dataset:
         dataset = load_dataset(work.folder)
         for note in dataset.notes or ():
             work.warn(note)
-        work.noted("collect", "cached", None)
+        work.noted("collect", **work.history["collect"])  # with what was told
         return dataset
     began = time.perf_counter()
     try:
@@ -95,7 +95,7 @@ def train(work: Run) -> None:
     if work.unchanged("train", key, f"preset {learn.method.preset}"):
         for doubt in read_json(work.folder / "model.json")["provenance"]["doubts"]:
             work.warn(doubt)
-        work.noted("train", "cached", None)
+        work.noted("train", **work.history["train"])  # with what was told
         return
     from exlinn_fmi.data.dataset import split
     from exlinn_fmi.learn.card import report_card
