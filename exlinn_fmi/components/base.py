@@ -84,6 +84,7 @@ class Variable:
         wide: type of whole numbers of 64 bits, of which float64 does not hold all. What it lacks of the value
             of variable k, the *rest*, is set and got at index k + `len(variables)`, in one call with the
             value.
+        clocked: whether it is an input that could be set at the ticks of its clock alone; it keeps its start.
     """
 
     name: str
@@ -98,6 +99,7 @@ class Variable:
     max: Number | None = None
     si: SiUnit | None = None
     wide: Literal["int64", "uint64"] | None = None
+    clocked: bool = False
 
 
 class Component(ABC):

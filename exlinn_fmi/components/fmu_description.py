@@ -313,12 +313,13 @@ def _variable(v: Any, units: Mapping[str, SiUnit]) -> Any:
     declared = v.declaredType
     causality: Causality = v.causality
     variability: Variability = v.variability
+    clocked = False
     if v.causality in ("calculatedParameter", "none"):
         causality = "local"
     elif v.causality == "structuralParameter":
         causality, variability = "parameter", "fixed"
     elif v.causality == "input" and getattr(v, "clocks", None):
-        causality = "local"  # it may be set in the instant of its clock's tick alone
+        causality, clocked = "local", True  # it may be set in the instant of its clock's tick alone
     low, high = v.min or getattr(declared, "min", None), v.max or getattr(declared, "max", None)
     if v.type == "Enumeration" and declared is not None and declared.items:
         items = [int(item.value) for item in declared.items]
@@ -342,6 +343,7 @@ def _variable(v: Any, units: Mapping[str, SiUnit]) -> Any:
             max=most,
             si=si,
             wide=_WIDE.get(v.type),
+            clocked=clocked,
         )
 
     return make

@@ -75,6 +75,8 @@ def _misfits(source: str, tail: Variable, target: str, head: Variable, link: Lin
     elif head.causality == "parameter" and head.variability != "tunable":
         component, name = target.split(".", 1)
         yield f"{target} is a {head.variability} parameter; set it in components.{component}.start.{name}"
+    elif head.clocked:
+        yield f"{target} is an input of a clock, which keeps its start value; connect one without a clock"
     elif head.causality not in ("input", "parameter"):
         kind = "an output" if head.causality == "output" else "no input"
         yield f"{target} is {kind}; a connection ends at an input"

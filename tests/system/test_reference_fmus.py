@@ -141,6 +141,16 @@ def test_van_der_pol_follows_scipy(opened, version: int, solver: str) -> None:
     assert driver.get("x0", "x1") == pytest.approx(expected.tolist(), abs=1e-5)
 
 
+@pytest.mark.parametrize("version", [2, 3])
+def test_van_der_pol_goes_by_eulers_method_in_co_simulation(opened, version: int) -> None:
+    driver = opened("VanDerPol", version, "co_simulation").begin(h=0.1, stop=10.0)
+    driver.run(30)
+    x0, x1 = 2.0, 0.0
+    for _ in range(300):
+        x0, x1 = x0 + 0.01 * x1, x1 + 0.01 * ((1 - x0 * x0) * x1 - x0)
+    assert driver.get("x0", "x1") == pytest.approx([x0, x1], abs=1e-9)
+
+
 def test_a_stiff_van_der_pol_is_handed_to_radau(opened) -> None:
     driver = opened("VanDerPol", 2, "model_exchange", tolerance=1e-6).begin(h=100.0, stop=400.0, mu=200.0)
     statuses = [driver.step() for _ in range(4)]
