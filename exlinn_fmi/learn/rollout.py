@@ -24,14 +24,30 @@ def free_run(system: LagrangianSystem, data: Dataset) -> Float[NDArray[np.float6
     Returns:
         States at the rows of the data, not finite from where the run diverged.
     """
-    time = data.frame["time"].to_numpy(dtype=float)
-    states = data.frame[system.state_names].to_numpy(dtype=float)
-    inputs = data.frame[system.input_names].to_numpy(dtype=float)
+    columns = (["time"], system.state_names, system.input_names)
+    time, states, inputs = (data.frame[names].to_numpy(dtype=float) for names in columns)
+    return run_from(system, time[:, 0], states[0], inputs)
+
+
+def run_from(
+    system: LagrangianSystem,
+    time: Float[NDArray[np.float64], " N"],
+    start: Float[NDArray[np.float64], " nx"],
+    inputs: Float[NDArray[np.float64], "N nu"],
+) -> Float[NDArray[np.float64], "N nx"]:
+    """The same from any state.
+
+    Args:
+        system: the model.
+        time: of the rows [s].
+        start: state at the first row.
+        inputs: held from each row to the next.
+    """
     model = LagrangianComponent("model", system)
-    model.enter_initialization(time[0], time[-1], dict(zip(system.state_names, states[0], strict=True)))
+    model.enter_initialization(time[0], time[-1], dict(zip(system.state_names, start, strict=True)))
     model.exit_initialization()
     driven, moved = model.indices("input"), [model.index(name) for name in system.state_names]
-    run = states[:1].repeat(len(time), axis=0)
+    run = start[None].repeat(len(time), axis=0)
     for k, step in enumerate(np.diff(time)):
         model.set(driven, inputs[k])
         model.step(time[k], step)

@@ -8,6 +8,7 @@ is put beside that movement. A model that is no better than one in which nothing
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.errors import ModelError
 from exlinn_fmi.learn.noise import noise_levels
-from exlinn_fmi.learn.rollout import free_run
+from exlinn_fmi.learn.rollout import run_from
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, internal_steps
 
 Array = NDArray[np.float64]
@@ -72,42 +73,51 @@ def judge(system: LagrangianSystem, data: Dataset) -> Verdict:
         data: trajectories.
     """
     velocities = [c.velocity for c in system.coordinates]
-    parts = [data.select([number]) for number in data.trajectories]
-    measured = [part.frame[velocities].to_numpy(dtype=float) for part in parts]
-    spread = data.frame[system.state_names].to_numpy(dtype=float).std(axis=0)
-    unsure = np.maximum(noise_levels(data), UNSURE * spread) * (-1.0) ** np.arange(len(spread))
-    noise, spread = (x[-len(velocities) :] for x in (noise_levels(data), spread))
-    steps = _steps(measured, np.maximum(MOVED * spread, BEYOND * noise))
+    n, names = len(velocities), ["time", *system.state_names, *system.input_names]
+    table, numbers = data.frame[names].to_numpy(dtype=float), data.frame["trajectory"].to_numpy()
+    recorded = [table[numbers == k] for k in data.trajectories]
+    last = len(system.state_names) + 1
+    time, states, inputs = (
+        [part[:, cut] for part in recorded] for cut in (0, slice(1, last), slice(last, None))
+    )
+    spread, noise = table[:, 1:last].std(axis=0), noise_levels(data)
+    unsure = np.maximum(noise, UNSURE * spread) * (-1.0) ** np.arange(len(spread))
+    noise, spread = noise[-n:], spread[-n:]
+    steps = _steps([x[:, -n:] for x in states], np.maximum(MOVED * spread, BEYOND * noise))
     apart = max(steps // 2, 1)
-    starts = [(k, row) for k, v in enumerate(measured) for row in range(0, len(v) - steps, apart)]
+    starts = [(k, row) for k, x in enumerate(states) for row in range(0, len(x) - steps, apart)]
     count = max(min(RUNS, STEPS // (steps * _internal(system, data))), 1)
-    errors, moves, shifts, times, durations = [], [], [], [], []
-    for index in np.unique(np.linspace(0, len(starts) - 1, count).astype(int)):
-        k, row = starts[index]
-        window = slice(row, row + steps + 1)
-        frame = parts[k].frame[window]
-        other = frame.copy()
-        other.loc[frame.index[0], system.state_names] += unsure
-        run, shaken = (
-            free_run(system, Dataset(part, data.coordinates))[:, -len(velocities) :]
-            for part in (frame, other)
-        )
+    windows = [
+        (k, slice(starts[i][1], starts[i][1] + steps + 1))
+        for i in np.unique(np.linspace(0, len(starts) - 1, count).astype(int))
+        for k in [starts[i][0]]
+    ]
+
+    def runs(off: Array) -> list[Array]:
+        """Velocities from states that are so far off."""
+        return [
+            run_from(system, time[k][rows], states[k][rows][0] + off, inputs[k][rows])[:, -n:]
+            for k, rows in windows
+        ]
+
+    def squares(pairs: Iterable[tuple[Array, Array]]) -> Float[Array, "r n"]:
         with np.errstate(over="ignore", invalid="ignore"):
-            errors.append(np.mean((run - measured[k][window]) ** 2, axis=0))
-            shifts.append(np.mean((run - shaken) ** 2, axis=0))
-        moves.append(np.mean((measured[k][window] - measured[k][row]) ** 2, axis=0))
-        times.append(float(frame["time"].iloc[0]))
-        durations.append(float(np.ptp(frame["time"])))
-    error, moved = np.nan_to_num(np.array(errors), nan=np.inf), np.mean(moves, axis=0)
+            return np.array([np.mean((one - other) ** 2, axis=0) for one, other in pairs])
+
+    found, measured = runs(0 * unsure), [states[k][rows][:, -n:] for k, rows in windows]
+    error = np.nan_to_num(squares(zip(found, measured, strict=True)), nan=np.inf)
+    moved = squares((x, x[:1]) for x in measured).mean(axis=0)
+    rest = error.mean(axis=0)
+    if (rest > POOR**2 * moved).any():  # only then is there anything to excuse
+        shifts = squares(zip(found, runs(unsure), strict=True)).mean(axis=0)
+        rest = np.maximum(rest - np.fmin(EXCUSED**2 * shifts, MOST * moved), 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        excused = np.fmin(EXCUSED**2 * np.mean(shifts, axis=0), MOST * moved)
-        rest = np.maximum(error.mean(axis=0) - excused, 0)
         share = np.where(np.sqrt(moved) > TOLD * noise, np.sqrt(rest / moved), 0.0)
     worst = int(np.argmax(share))
+    began = [float(time[k][rows][0]) for k, rows in windows]
+    duration = float(np.median([np.ptp(time[k][rows]) for k, rows in windows]))
     name = velocities[worst] if (np.sqrt(moved) > TOLD * noise).any() else ""
-    return Verdict(
-        name, float(share[worst]), float(np.median(durations)), times[int(np.argmax(error[:, worst]))]
-    )
+    return Verdict(name, float(share[worst]), duration, began[int(np.argmax(error[:, worst]))])
 
 
 def _internal(system: LagrangianSystem, data: Dataset) -> int:
