@@ -311,12 +311,16 @@ class Instance3(Instance):
         return Update(again, terminate, nominals, states, when.value if defined else math.inf)
 
     def step_to_event(self, t: float, h: float) -> tuple[int, float, bool]:
-        """fmi3DoStep, which may return early: code, time reached [s], and whether there is an event."""
+        """fmi3DoStep, which may return early: code, time reached [s], and whether there is an event.
+
+        Where it did not return early the step is done, although an FMU whose own steps are longer may tell
+        the time of the last of them.
+        """
         code: int = self._do_step(self.pointer, t, h, not self.roll_back, *self._outcome)
         if self._end.value:
             self.remark = f"the FMU asks to end the simulation, at t = {self._reached.value:.9g} s"
             code = max(code, DISCARD)
-        return code, self._reached.value, self._event.value
+        return code, self._reached.value if self._early.value else t + h, self._event.value
 
     def state_counts(self) -> tuple[int, int]:
         """As the FMU counts them: structural parameters may have changed them."""

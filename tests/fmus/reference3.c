@@ -241,6 +241,9 @@ EXPORT fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 t, fmi3Float64 h, fmi3B
         if (f->early) break;
     }
     *reached = f->v.r[0];
+#ifdef COARSE  /* the time of the last of its own steps, as if they were that long */
+    if (!*early) *reached = COARSE * floor(f->v.r[0] / COARSE);
+#endif
 #ifdef FAULT_STEP
     if (f->v.r[0] > 0.5) return FAULT_STEP;
 #endif

@@ -263,6 +263,15 @@ def test_input_derivatives_reach_a_co_simulation_fmu_for_one_step(opened) -> Non
     assert not opened("Switch", 3, "co_simulation").component.takes_input_derivatives
 
 
+def test_steps_shorter_than_those_of_the_fmu_are_done_whatever_time_it_tells(opened) -> None:
+    x = []
+    for defines in ((), ("COARSE=0.1",)):
+        driver = opened("Dahlquist", 3, "co_simulation", *defines).begin(h=0.01, stop=1.0)
+        driver.run(25)
+        x += driver.get("x")
+    assert x[0] == x[1]
+
+
 def test_an_event_after_a_step_is_heeded_and_so_is_the_wish_to_end(opened) -> None:
     driver = opened("Switch", 2, "model_exchange").begin(h=0.1, stop=20.0, set=200.0)
     driver.set(load=100.0)
