@@ -223,7 +223,7 @@ def simulate(work: Run, resume: bool = False) -> None:
     if result.error is None:
         work.done("simulate", key, written, began)
     if store is not None and (result.error is None or span.checkpoint is None):
-        store.remove()  # not before: who is killed until here goes on from the last checkpoint
+        remove_part(work)  # not before: who is killed until here goes on from the last checkpoint
     if result.error is not None:
         raise work.failed("simulate", result.error)
 

@@ -33,7 +33,7 @@ TEXT_TYPES: tuple[VariableType, ...] = ("String", "Binary")
 """Types whose values are numbers that stand for texts, see `components.texts`."""
 
 Number = float | int
-"""A number; a whole one that float64 does not hold is an int."""
+"""A number; a whole one that float64 may not hold is an int, see `wide.exact`."""
 
 Values = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -20,6 +20,7 @@ import fmpy
 from exlinn_fmi.components.base import Causality, Number, SiUnit, Variability, Variable, VariableType
 from exlinn_fmi.components.fmu_interfaces import Interface, Kind, choose_interface, read_interfaces
 from exlinn_fmi.components.texts import handle
+from exlinn_fmi.components.wide import exact
 from exlinn_fmi.errors import FmuError
 
 MOST_ELEMENTS = 1_000_000
@@ -384,8 +385,7 @@ def _number(text: str | int | None) -> Number | None:
         return None
     if text in ("true", "false"):
         return float(text == "true")
-    number = float(text)
-    return int(text) if abs(number) > 2**53 and str(text).lstrip("+-").isdecimal() else number
+    return exact(int(text) if str(text).lstrip("+-").isdecimal() else float(text))
 
 
 def _experiment(stated: Any) -> DefaultExperiment:

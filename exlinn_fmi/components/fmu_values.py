@@ -113,14 +113,7 @@ class Texts(Group):
     """Texts or binaries, scalars and arrays alike."""
 
     def __init__(
-        self,
-        instance: Instance,
-        verb: str,
-        accessor: str,
-        references: list[int],
-        positions: Any,
-        array: Any,
-        rests: Any,
+        self, instance: Instance, verb: str, accessor: str, references: list[int], positions: Any, array: Any
     ) -> None:
         self.accessor, self.positions = accessor, positions
         self._references = reference_buffer(references)
@@ -206,18 +199,20 @@ def groups(
     for (accessor, reference), places in by_call(description, indices[chosen]).items():
         where = chosen[places]
         positions: Any = slice(None) if len(where) == len(indices) else where
-        kind = Texts if accessor in TEXTS else Numbers
-        pairs = rests_of(description, indices, where)
-        rests = tuple(np.array(part) for part in zip(*pairs, strict=True)) if pairs else None
+        array = None
         if reference is None:
             references = [description.references[k] for k in indices[where]]
-            made.append(kind(instance, verb, accessor, references, positions, None, rests))
         else:
             elements = np.array([description.elements[k] for k in indices[where]], dtype=np.intp)
             whole = arrays[accessor, reference]
-            if verb == "Get":
-                whole = whole.copy()
-            made.append(kind(instance, verb, accessor, [reference], positions, (elements, whole), rests))
+            references, array = [reference], (elements, whole.copy() if verb == "Get" else whole)
+        common = instance, verb, accessor, references, positions, array
+        if accessor in TEXTS:
+            made.append(Texts(*common))
+            continue
+        pairs = rests_of(description, indices, where)
+        rests = tuple(np.array(part) for part in zip(*pairs, strict=True)) if pairs else None
+        made.append(Numbers(*common, rests))
     return made
 
 

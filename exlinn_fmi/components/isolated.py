@@ -23,6 +23,7 @@ from exlinn_fmi.components.base import Component, Indices, Number, Status, Value
 from exlinn_fmi.components.fmu import FmuComponent, FmuSettings, read_variables
 from exlinn_fmi.components.process import PATIENCE, LostError, Process
 from exlinn_fmi.components.texts import handle, text
+from exlinn_fmi.components.wide import exact
 from exlinn_fmi.components.worker import (
     CALL,
     EXCHANGE,
@@ -112,10 +113,7 @@ class IsolatedComponent(Component):
         """As the component itself."""
         self._pending, self._undoable, self._time = -1, False, start_time
         texts = {self.variables[k].name for k in self._texts}
-        given = {
-            n: self._sent(float(v)) if n in texts else v if type(v) is int else float(v)
-            for n, v in starts.items()
-        }
+        given = {n: self._sent(float(v)) if n in texts else exact(v) for n, v in starts.items()}
         return self._status("enter_initialization", start_time, stop_time, given, what="initialisation")
 
     def exit_initialization(self) -> Status:

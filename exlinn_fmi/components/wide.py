@@ -10,10 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from exlinn_fmi.components.base import Values
+from exlinn_fmi.components.base import Number, Values
 
+EXACT = 2**53
+"""Whole numbers up to it are float64."""
 UNIT = 2048
 """Numbers below 2⁶⁴ that are multiples of it are float64."""
+
+
+def exact(value: Number) -> Number:
+    """A number as float64, or as it is where that may not hold it."""
+    return value if isinstance(value, int) and abs(value) > EXACT else float(value)
 
 
 def rest_of(whole: NDArray[Any]) -> Values:

@@ -38,11 +38,10 @@ def diagnose(
         )
     targets = ocp.targets(references)
     if ocp.terminal == "dare" and not targets.riccati:
+        without = ", without a terminal set" if ocp.set_weight else ""
         found.append(
             "the Riccati equation has no solution at the reference: "
-            f"the terminal cost is {FALLBACK_TERMINAL:g} Q"
-            + ", without a terminal set"
-            * bool(ocp.set_weight)
+            f"the terminal cost is {FALLBACK_TERMINAL:g} Q{without}"
         )
     elif ocp.set_weight and targets.level == 0.0:
         found.append(

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.control.batch import Batch
 from exlinn_fmi.control.riccati import solve_dare
+from exlinn_fmi.mechanics.coordinates import full_turn
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
-from exlinn_fmi.mechanics.learned import TURN
 
 QUIET = np.errstate(over="ignore", invalid="ignore")
 """What leaves the finite is told by the belief (`Belief.finite`), not by warnings."""
@@ -294,7 +294,7 @@ def unobservable(estimator: Estimator, x: Float[np.ndarray, " n"], u: Float[np.n
 
 def _turns(system: LagrangianSystem) -> NDArray[np.float64]:
     """A full turn for the states that are angles, NaN for the others."""
-    turns = {c.name: TURN.get(c.unit, 2 * np.pi) for c in system.coordinates if c.topology == "circle"}
+    turns = {c.name: full_turn(c.unit) for c in system.coordinates if c.topology == "circle"}
     return np.array([turns.get(name, np.nan) for name in system.state_names])
 
 

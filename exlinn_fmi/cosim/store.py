@@ -8,7 +8,6 @@ the disk: whenever the run is killed, the two fit together.
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -131,10 +130,6 @@ class Store:
         if not self._always and 8 * rows * columns <= FULL_FRAME:
             return None
         return RowFile(self.folder / "rows.f64", columns, keep=self.resume)
-
-    def remove(self) -> None:
-        """Remove all of it."""
-        shutil.rmtree(self.folder, ignore_errors=True)
 
     def save(self, state: Mapping[str, Any], rows: RowFile) -> None:
         """Write a checkpoint.

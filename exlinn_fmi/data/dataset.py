@@ -19,7 +19,15 @@ import pandas as pd
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike, NDArray
 
-from exlinn_fmi.data.derivatives import SHORTEST, Between, best_window, derivative, integral
+from exlinn_fmi.data.derivatives import (
+    LEAST_NOISE,
+    SHORTEST,
+    Between,
+    best_window,
+    derivative,
+    integral,
+    noise_level,
+)
 from exlinn_fmi.data.files import read_json, read_table, write_json, write_table
 from exlinn_fmi.errors import DataError
 from exlinn_fmi.mechanics.coordinates import (
@@ -32,6 +40,8 @@ from exlinn_fmi.mechanics.coordinates import (
 
 MINIMUM_ROWS = 20
 """Fewest samples that a model is trained on."""
+TELLING = 20
+"""Fewest rows of a trajectory that its noise is estimated from."""
 
 
 class Samples(NamedTuple):
@@ -131,6 +141,22 @@ class Dataset:
             if c.input is not None:
                 force[:, i] = self.frame[name(c.input) if name(c.input) in self.frame else c.input]
         return force
+
+    @cached_property
+    def noise(self) -> Float[NDArray[np.float64], " nx"]:
+        """Standard deviation of the white noise on each state, in its unit.
+
+        Trajectories that are too short to tell are left out.
+        """
+        names = state_names(self.coordinates)
+        squares, rows = np.zeros(len(names)), 0
+        for _, part in self.frame.groupby("trajectory"):
+            if len(part) >= TELLING:
+                values = part[names].to_numpy(dtype=float)
+                squares += len(part) * np.array([noise_level(column) ** 2 for column in values.T])
+                rows += len(part)
+        size = np.abs(self.frame[names].to_numpy(dtype=float)).max(axis=0)
+        return np.maximum(np.sqrt(squares / max(rows, 1)), LEAST_NOISE * np.where(size > 0, size, 1))
 
     @property
     def trajectories(self) -> list[int]:

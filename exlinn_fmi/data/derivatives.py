@@ -84,6 +84,10 @@ def integral(time: Signal, values: Signal, between: Between, order: int = 1) -> 
     return np.concatenate([[0.0], np.cumsum(h * once[:-1] + h**2 * (2 * now + after) / 6)])
 
 
+LEAST_NOISE = 1e-12
+"""Least noise that a signal is taken to have, as a share of its size: that of floating point, summed up."""
+
+
 def noise_level(values: Signal) -> float:
     """Standard deviation of white noise on a smooth signal, from its eighth differences.
 

@@ -25,7 +25,7 @@ from exlinn_fmi.data.derivatives import (
 )
 from exlinn_fmi.data.faults import plateaus, spike, stuck
 from exlinn_fmi.errors import DataError
-from exlinn_fmi.mechanics.coordinates import Coordinate, input_names, state_names
+from exlinn_fmi.mechanics.coordinates import Coordinate, full_turn, input_names, state_names
 
 Signal = Float[NDArray[np.float64], " N"]
 
@@ -269,17 +269,13 @@ def doubts(
 
 def _turns_per_row(parts: Sequence[pd.DataFrame], c: Coordinate) -> float:
     """Furthest that an angle moves from one row to the next."""
-    from exlinn_fmi.mechanics.learned import TURN
-
     moves = [np.abs(np.diff(part[c.name].to_numpy(dtype=float))).max(initial=0.0) for part in parts]
-    return float(max(moves)) / TURN.get(c.unit, 2 * np.pi)
+    return float(max(moves)) / full_turn(c.unit)
 
 
 def _covered(angles: Sequence[pd.Series[float]], unit: str) -> float:
     """Share of the circle that an angle visits."""
-    from exlinn_fmi.mechanics.learned import TURN
-
-    turn = TURN.get(unit, 2 * np.pi)
+    turn = full_turn(unit)
     sectors = np.floor(np.mod(np.concatenate(angles), turn) / turn * SECTORS)
     return len(np.unique(sectors)) / SECTORS
 

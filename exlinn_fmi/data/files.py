@@ -188,9 +188,9 @@ def _write_tables(
     tables = (_table(frame, units) for frame in frames)
     first = next(tables)
     texts = [f.name for f in first.schema if texts_apart and not _is_number(f.type)]
-    paths = [_beside(stem, suffix) for suffix in (".csv", ".parquet", ".meta.json", ".texts.csv")]
-    spare = paths[3:] if not texts else []
-    paths = paths[: 4 - len(spare)]
+    paths = [_beside(stem, suffix) for suffix in (".csv", ".parquet", ".meta.json")]
+    apart = _beside(stem, ".texts.csv")
+    paths += [apart] if texts else []
     numbers = first.drop_columns(texts).schema
     with whole(*paths) as files:
         with (
@@ -204,8 +204,8 @@ def _write_tables(
                 to_texts(table)
         known = {f.name: f.metadata[UNIT].decode() for f in first.schema if f.metadata}
         files[2].write_text(json.dumps({"units": known}, indent=2, ensure_ascii=False) + "\n", "utf-8")
-    for path in spare:
-        path.unlink(missing_ok=True)  # of an earlier run
+    if not texts:
+        apart.unlink(missing_ok=True)  # of an earlier run
     return paths
 
 

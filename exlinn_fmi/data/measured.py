@@ -21,7 +21,7 @@ from exlinn_fmi.data.derivatives import EVEN, SHORTEST
 from exlinn_fmi.data.doubts import Recording, check_recordings, doubts
 from exlinn_fmi.data.foreign import ForeignTable, column_names, read_foreign
 from exlinn_fmi.errors import DataError
-from exlinn_fmi.mechanics.coordinates import Coordinate, input_names
+from exlinn_fmi.mechanics.coordinates import Coordinate, full_turn, input_names
 from exlinn_fmi.scenario.learning import Column, LowPass, Measured, Resample
 from exlinn_fmi.scenario.units import conversion
 
@@ -195,9 +195,7 @@ def convert(table: ForeignTable, column: Column, unit: str) -> Signal:
 
 def unwrap(angle: Signal, unit: str) -> Signal:
     """An angle without the jumps of sensors that begin anew after a full turn."""
-    from exlinn_fmi.mechanics.learned import TURN
-
-    return np.unwrap(angle, period=TURN.get(unit, 2 * np.pi))
+    return np.unwrap(angle, period=full_turn(unit))
 
 
 def _check_time(table: ForeignTable, time: Signal, column: str) -> None:

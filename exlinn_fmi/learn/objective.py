@@ -249,10 +249,9 @@ class Objective:
                 factors[i] = triangle(factors[i], np.column_stack([j[:, i], r[:, i]]))
             if not driven.all():
                 x, jx = chunk.inertia_jacobian(theta)
+                scale += _own(r, x, driven)
                 for i in np.flatnonzero(~driven).tolist():
-                    rest = r[:, i] - x[:, i]
-                    scale[i] += x[:, i] @ x[:, i] + rest @ rest
-                    growth[i] += x[:, i] @ jx[:, i] + rest @ (j - jx)[:, i]
+                    growth[i] += x[:, i] @ jx[:, i] + (r - x)[:, i] @ (j - jx)[:, i]
         for factor, size, g in zip(factors, scale, growth, strict=True):
             factor[:, :count] -= np.outer(factor[:, count], g / size)
             factor /= np.sqrt(n * size)

@@ -22,7 +22,7 @@ from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.learn.basis import entry, families, generic_basis
 from exlinn_fmi.learn.discover import COARSE, ROUNDS, Discovery, discover, eliminate, least_mass, spread_over
 from exlinn_fmi.learn.iterate import Iterate
-from exlinn_fmi.learn.noise import CLEAN, noise_levels, relative_noise
+from exlinn_fmi.learn.noise import CLEAN, relative_noise
 from exlinn_fmi.learn.projection import Make, solve
 from exlinn_fmi.learn.trajectory import Fit, Information, Shooting, cut
 from exlinn_fmi.learn.weak import Regression, inverse_regression, weak_regression
@@ -308,7 +308,7 @@ def prediction_error(basis: MonomialBasis, p: Float[Array, " P"], data: Dataset)
 def _notes(basis: MonomialBasis, found: Discovery, why: str, data: Dataset) -> dict[str, Any]:
     """Provenance: the objective and its reason, noise, and the terms with their deviations."""
     if found.fit.sigma.size:  # of states, as the residuals of trajectories show it
-        excess = float((found.fit.sigma / np.maximum(noise_levels(data), CLEAN * _size(data))).max())
+        excess = float((found.fit.sigma / np.maximum(data.noise, CLEAN * _size(data))).max())
         why += f"; {found.fit.information}"
         if excess > BEYOND and not found.fit.is_noise:
             why += f"; they leave residuals of {excess:.3g} times the noise: {NO_FORMULA}"

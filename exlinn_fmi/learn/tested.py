@@ -20,7 +20,6 @@ from exlinn_fmi.data.dataset import Dataset, Samples
 from exlinn_fmi.learn.adjoint import Adjoint, Upstream
 from exlinn_fmi.learn.assembly import Assembly, weak_assembly
 from exlinn_fmi.learn.networks import StructuredNetworks
-from exlinn_fmi.learn.noise import noise_levels
 from exlinn_fmi.learn.objective import Rows
 from exlinn_fmi.learn.windows import Windows, windows
 
@@ -195,7 +194,7 @@ def usual_accelerations(data: Dataset) -> Float[Array, "N n"]:
     """Root mean square of each acceleration, from differences of velocities that exceed their noise."""
     names = [c.velocity for c in data.coordinates]
     time, v = data.frame["time"].to_numpy(dtype=float), data.frame[names].to_numpy(dtype=float)
-    trajectory, noise = data.frame["trajectory"].to_numpy(), noise_levels(data)[-len(names) :]
+    trajectory, noise = data.frame["trajectory"].to_numpy(), data.noise[-len(names) :]
     longest = int(data.frame.groupby("trajectory").size().max()) - 1
     usual, unknown, apart = np.zeros(len(names)), np.ones(len(names), dtype=bool), 1
     while unknown.any():

@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from exlinn_fmi.data.dataset import Dataset
+from exlinn_fmi.data.derivatives import LEAST_NOISE
 from exlinn_fmi.errors import DataError, TrainingError
 from exlinn_fmi.learn.colour import colour, spread_of
 from exlinn_fmi.learn.levenberg import Normal, levenberg_marquardt
 from exlinn_fmi.learn.motion import NetworkMotion
 from exlinn_fmi.learn.networks import StructuredNetworks
-from exlinn_fmi.learn.noise import FLOOR, noise_levels
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem
 from exlinn_fmi.mechanics.sensitivity import Motion, Propagator
 
@@ -121,7 +121,7 @@ def cut(data: Dataset, states: list[str], inputs: list[str], every: int = 1) -> 
         np.array(counted, dtype=float),
         np.array(follows),
         np.array(lengths),
-        noise_levels(data),
+        data.noise,
     )
 
 
@@ -361,7 +361,7 @@ class Shooting:
         free = self._motion.size / rest.shape[2] + float(np.sum(self.data.follows < 0))
         share = np.sqrt(np.sum(rest**2, axis=(0, 1)) / max(self.data.total - free, 1))
         size = np.abs(self.data.measured).max(axis=(0, 1))
-        return np.asarray(np.maximum(self.data.sigma * share, FLOOR * np.where(size > 0, size, 1)))
+        return np.asarray(np.maximum(self.data.sigma * share, LEAST_NOISE * np.where(size > 0, size, 1)))
 
 
 def maximum_likelihood(

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.errors import ModelError
-from exlinn_fmi.learn.noise import noise_levels
 from exlinn_fmi.learn.rollout import run_from
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, internal_steps
 
@@ -80,18 +79,15 @@ def judge(system: LagrangianSystem, data: Dataset) -> Verdict:
     time, states, inputs = (
         [part[:, cut] for part in recorded] for cut in (0, slice(1, last), slice(last, None))
     )
-    spread, noise = table[:, 1:last].std(axis=0), noise_levels(data)
+    spread, noise = table[:, 1:last].std(axis=0), data.noise
     unsure = np.maximum(noise, UNSURE * spread) * (-1.0) ** np.arange(len(spread))
     noise, spread = noise[-n:], spread[-n:]
     steps = _steps([x[:, -n:] for x in states], np.maximum(MOVED * spread, BEYOND * noise))
     apart = max(steps // 2, 1)
     starts = [(k, row) for k, x in enumerate(states) for row in range(0, len(x) - steps, apart)]
     count = max(min(RUNS, STEPS // (steps * _internal(system, data))), 1)
-    windows = [
-        (k, slice(starts[i][1], starts[i][1] + steps + 1))
-        for i in np.unique(np.linspace(0, len(starts) - 1, count).astype(int))
-        for k in [starts[i][0]]
-    ]
+    chosen = [starts[i] for i in np.unique(np.linspace(0, len(starts) - 1, count).astype(int))]
+    windows = [(k, slice(row, row + steps + 1)) for k, row in chosen]
 
     def runs(off: Array) -> list[Array]:
         """Velocities from states that are so far off."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,6 +10,14 @@ from exlinn_fmi.errors import ModelError
 
 Kind = Literal["mechanical", "electrical"]
 Topology = Literal["line", "circle", "cyclic"]
+
+TURN = {"rad": math.tau, "mrad": 1000 * math.tau, "deg": 360.0, "rev": 1.0}
+"""A full turn in the units that an angle may have."""
+
+
+def full_turn(unit: str) -> float:
+    """A full turn in the unit of an angle; units not in `TURN` are read as rad."""
+    return TURN.get(unit, math.tau)
 
 
 @dataclass(frozen=True)

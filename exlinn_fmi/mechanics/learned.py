@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from exlinn_fmi.errors import ModelError
-from exlinn_fmi.mechanics.coordinates import Coordinate, Parameter, check_coordinates
+from exlinn_fmi.mechanics.coordinates import Coordinate, Parameter, check_coordinates, full_turn
 from exlinn_fmi.mechanics.euler_lagrange import LagrangianSystem, Symbol
 from exlinn_fmi.mechanics.friction import log_cosh, stribeck
 from exlinn_fmi.mechanics.layout import Layout
@@ -46,9 +46,6 @@ NARROWEST = 0.02
 
 FAITHFUL = 2.0
 """The position of a line is what it is within so many times its reach in the data; there it saturates."""
-
-TURN = {"rad": 2 * np.pi, "mrad": 2000 * np.pi, "deg": 360.0, "rev": 1.0}
-"""A full turn in the units that an angle may have; any other is read as rad."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +196,7 @@ class Networks:
 
 def angular(coordinate: Coordinate) -> float:
     """Factor from the unit of an angle to rad."""
-    return 2 * np.pi / TURN.get(coordinate.unit, TURN["rad"])
+    return 2 * np.pi / full_turn(coordinate.unit)
 
 
 def learned_system(spec: ModelSpec, weights: Weights) -> LagrangianSystem:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from exlinn_fmi.components.base import Variable
 from exlinn_fmi.errors import DataError, ModelError
-from exlinn_fmi.mechanics.coordinates import Coordinate, check_coordinates
+from exlinn_fmi.mechanics.coordinates import TURN, Coordinate, check_coordinates
 from exlinn_fmi.scenario.check_graph import is_multiple, misfit_starts, no_multiple
 from exlinn_fmi.scenario.control import Nmpc, Reference
 from exlinn_fmi.scenario.explain import Finding
@@ -217,7 +217,7 @@ def _monomial(
     at: KeyPath, text: str, coordinates: tuple[Coordinate, ...], shapes: Mapping[str, float]
 ) -> Iterator[Finding]:
     """A monomial that cannot be read, or that takes degrees for radians."""
-    from exlinn_fmi.mechanics.learned import TURN, angular
+    from exlinn_fmi.mechanics.learned import angular
     from exlinn_fmi.mechanics.monomials import parse_term
 
     try:

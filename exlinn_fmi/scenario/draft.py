@@ -12,7 +12,15 @@ from textwrap import indent
 
 from exlinn_fmi.components.base import TEXT_TYPES, Variable
 from exlinn_fmi.components.fmu_description import DefaultExperiment, FmuDescription
-from exlinn_fmi.scenario.draft_text import as_comment, as_key, as_name, as_text, distinct, scenario_name
+from exlinn_fmi.scenario.draft_text import (
+    as_comment,
+    as_key,
+    as_name,
+    as_text,
+    distinct,
+    kind_lines,
+    scenario_name,
+)
 from exlinn_fmi.scenario.guess import Guess, Quantity, guess_coordinates
 
 PLANT = "plant"
@@ -248,10 +256,7 @@ def _coordinate(guess: Guess, name: str, units: Mapping[str, str]) -> Iterator[s
     own = unit(guess.position, guess.unit)
     yield f"- name: {name}"
     yield f"  unit: {as_text(own)}"
-    yield from (["  kind: electrical"] if guess.kind == "electrical" else [])
-    turns = {"circle": "TODO: line if it never makes a full turn", "cyclic": "only its velocity counts"}
-    if guess.topology != "line":
-        yield f"  topology: {guess.topology}   # {turns[guess.topology]}"
+    yield from kind_lines(guess.kind, guess.topology, "only its velocity counts")
     yield from ([f"  position: {path(guess.position)}"] if guess.position else [])
     if guess.velocity:
         yield f"  velocity: {path(guess.velocity)}"

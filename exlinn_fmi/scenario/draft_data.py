@@ -7,7 +7,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from textwrap import indent
 
-from exlinn_fmi.scenario.draft_text import as_comment, as_key, as_name, as_text, distinct, scenario_name
+from exlinn_fmi.scenario.draft_text import (
+    as_comment,
+    as_key,
+    as_name,
+    as_text,
+    distinct,
+    kind_lines,
+    scenario_name,
+)
 from exlinn_fmi.scenario.guess import Guess, Quantity, guess_coordinates
 from exlinn_fmi.scenario.units import si_unit
 
@@ -96,10 +104,7 @@ def _data_coordinate(guess: Guess, names: Mapping[str, str]) -> Iterator[str]:
     name = names[guess.position.name] if guess.position else "Q"
     yield f"- name: {name}"
     yield f"  unit: {guess.unit}"
-    yield from (["  kind: electrical"] if guess.kind == "electrical" else [])
-    turns = {"circle": "TODO: line if it never makes a full turn", "cyclic": "only the current counts"}
-    if guess.topology != "line":
-        yield f"  topology: {guess.topology}   # {turns[guess.topology]}"
+    yield from kind_lines(guess.kind, guess.topology, "only the current counts")
     if guess.velocity and names[guess.velocity.name] != f"{name}_dot":
         yield f"  velocity: {names[guess.velocity.name]}"
     yield from ([f"  velocity_unit: {guess.velocity_unit}"] if guess.kind == "electrical" else [])

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import count
 from pathlib import Path
+
+from exlinn_fmi.mechanics.coordinates import Kind, Topology
 
 _WORDS = ("true", "false", "null")
 """What YAML would not take for a text."""
@@ -51,3 +53,12 @@ def as_comment(value: str) -> str:
     """A text as part of a comment: on one line, not too long."""
     flat = " ".join("".join(c if c.isprintable() else " " for c in value).split())
     return flat if len(flat) <= 90 else f"{flat[:89]}…"
+
+
+def kind_lines(kind: Kind, topology: Topology, cyclic: str) -> Iterator[str]:
+    """What kind of coordinate it is, where that has to be said; and what a cyclic one's velocity is for."""
+    if kind == "electrical":
+        yield "  kind: electrical"
+    told = {"circle": "TODO: line if it never makes a full turn", "cyclic": cyclic}
+    if topology != "line":
+        yield f"  topology: {topology}   # {told[topology]}"

@@ -15,6 +15,7 @@ from pydantic import Discriminator, Field, Tag
 
 from exlinn_fmi.components.base import Number
 from exlinn_fmi.components.texts import handle
+from exlinn_fmi.components.wide import exact
 from exlinn_fmi.scenario.control import Nmpc
 from exlinn_fmi.scenario.events import Event
 from exlinn_fmi.scenario.learning import AnyLearn
@@ -50,14 +51,7 @@ class ComponentBase(Spec):
     def starts(self) -> dict[str, Number]:
         """Start values as components take them: arrays by element, texts by number, large numbers exactly."""
         flat = flat_starts(self.start)
-        return {
-            name: handle(v)
-            if isinstance(v, str)
-            else v
-            if isinstance(v, int) and abs(v) > 2**53
-            else float(v)
-            for name, v in flat.items()
-        }
+        return {name: handle(v) if isinstance(v, str) else exact(v) for name, v in flat.items()}
 
 
 class FmuComponent(ComponentBase):

@@ -11,7 +11,7 @@ from learn_helpers import multisine, simulate
 
 from exlinn_fmi.data.dataset import Dataset
 from exlinn_fmi.errors import DataError
-from exlinn_fmi.learn.noise import CLEAN, noise_levels, relative_noise
+from exlinn_fmi.learn.noise import CLEAN, relative_noise
 from exlinn_fmi.learn.trajectory import Information, Shooting, cut, maximum_likelihood
 from exlinn_fmi.learn.weak import inverse_regression, weak_regression
 from exlinn_fmi.mechanics.coordinates import Coordinate
@@ -59,7 +59,7 @@ def test_clean_data_are_found_clean() -> None:
 
 def test_short_trajectories_say_nothing_of_noise() -> None:
     short = Dataset(noisy(0.02).frame[:10], COORDINATES)
-    assert (noise_levels(short) < 1e-9).all()
+    assert (short.noise < 1e-9).all()
 
 
 def test_weak_form_needs_no_accelerations() -> None:
