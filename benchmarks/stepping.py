@@ -35,7 +35,7 @@ from exlinn_fmi.cosim.graph import Graph
 from exlinn_fmi.cosim.master import Master
 from exlinn_fmi.cosim.plan import Plan
 from exlinn_fmi.cosim.recorder import select
-from exlinn_fmi.data.files import csv_file, parquet_file
+from exlinn_fmi.data.tables import csv_file, parquet_file
 from exlinn_fmi.scenario.signals import Sine
 from exlinn_fmi.toolchain import compile_library, find_compiler
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from exlinn_fmi.components.base import Component, Number
-from exlinn_fmi.data.files import write_table
+from exlinn_fmi.data.tables import write_table
 from exlinn_fmi.workspace import Run
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from exlinn_fmi.data.files import read_json, write_rows, write_table, write_text
+from exlinn_fmi.data.files import read_json, write_text
+from exlinn_fmi.data.tables import write_rows, write_table
 from exlinn_fmi.errors import ExlinnError, InputError, RunError
 from exlinn_fmi.experiment import cosimulate, experiment, remove_part, store_of
 from exlinn_fmi.factory import inspect

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from exlinn_fmi.data.files import write_json, write_table
+from exlinn_fmi.data.files import write_json
+from exlinn_fmi.data.tables import write_table
 
 COMPONENTS = """\
 name: {name}

@@ -28,7 +28,8 @@ from exlinn_fmi.data.derivatives import (
     integral,
     noise_level,
 )
-from exlinn_fmi.data.files import read_json, read_table, write_json, write_table
+from exlinn_fmi.data.files import read_json, write_json
+from exlinn_fmi.data.tables import read_table, write_table
 from exlinn_fmi.errors import DataError
 from exlinn_fmi.mechanics.coordinates import (
     Coordinate,

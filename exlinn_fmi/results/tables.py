@@ -14,7 +14,8 @@ from typing import Any
 
 import pandas as pd
 
-from exlinn_fmi.data.files import file_hash, read_record, read_table, write_json
+from exlinn_fmi.data.files import file_hash, read_record, write_json
+from exlinn_fmi.data.tables import read_table
 from exlinn_fmi.errors import DataError, Problem, ScenarioError
 from exlinn_fmi.scenario.document import parse
 from exlinn_fmi.scenario.explain import schema_findings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pandas import DataFrame
 
-from exlinn_fmi.data.files import read_table
+from exlinn_fmi.data.tables import read_table
 from exlinn_fmi.pipeline import Run, collect, simulate
 from exlinn_fmi.plants import plant
 from exlinn_fmi.workspace import metrics

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exlinn_fmi.data import files
+from exlinn_fmi.data import files, tables
 from exlinn_fmi.data.files import file_hash, read_record
 from exlinn_fmi.errors import DataError, StorageError
 
@@ -38,35 +38,35 @@ def no_stand_ins(folder: Path) -> bool:
 @settings(max_examples=30, deadline=None)
 def test_csv_reads_back_to_the_last_bit(tmp_path_factory: pytest.TempPathFactory, values: list[float]):
     stem = tmp_path_factory.mktemp("t") / "table"
-    files.write_table(stem, frame_of(values), {})
+    tables.write_table(stem, frame_of(values), {})
     stem.with_suffix(".parquet").unlink()
-    back, _ = files.read_table(stem)
+    back, _ = tables.read_table(stem)
     assert back["plant.A[1,2]"].to_numpy().astype(float).tobytes() == np.array(values).tobytes()
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".csv"])
 def test_table_keeps_values_names_and_units(tmp_path: Path, suffix: str):
     frame = frame_of(AWKWARD)
-    files.write_table(tmp_path / "t", frame, {"time": "s", "plant.A[1,2]": "N.m"})
+    tables.write_table(tmp_path / "t", frame, {"time": "s", "plant.A[1,2]": "N.m"})
     (tmp_path / "t.csv" if suffix == ".parquet" else tmp_path / "t.parquet").unlink()
-    back, units = files.read_table(tmp_path / "t")
+    back, units = tables.read_table(tmp_path / "t")
     assert list(back) == list(frame)
     assert units == {"time": "s", "plant.A[1,2]": "N.m"}
     np.testing.assert_array_equal(back.to_numpy(float), frame.to_numpy(float))
 
 
 def test_csv_has_plain_header_numbers_and_booleans(tmp_path: Path):
-    files.write_table(tmp_path / "t", frame_of([0.1, -2.0]), {})
+    tables.write_table(tmp_path / "t", frame_of([0.1, -2.0]), {})
     assert (tmp_path / "t.csv").read_text() == 'time,"plant.A[1,2]",plant.on\n0,0.1,1\n0.001,-2,0\n'
 
 
 def test_write_table_tells_which_files_it_wrote(tmp_path: Path):
-    written = files.write_table(tmp_path / "t", frame_of([1.0]), {})
+    written = tables.write_table(tmp_path / "t", frame_of([1.0]), {})
     assert sorted(written) == sorted(tmp_path.iterdir())
 
 
 def test_pandas_reads_the_csv_exactly(tmp_path: Path):
-    files.write_table(tmp_path / "t", frame_of(AWKWARD), {})
+    tables.write_table(tmp_path / "t", frame_of(AWKWARD), {})
     back = pd.read_csv(tmp_path / "t.csv")
     np.testing.assert_array_equal(back.to_numpy(float), frame_of(AWKWARD).to_numpy(float))
     assert list(back) == ["time", "plant.A[1,2]", "plant.on"]
@@ -76,7 +76,7 @@ def test_fmpy_reads_the_csv_exactly(tmp_path: Path):
     from fmpy.util import read_csv
 
     frame = frame_of(AWKWARD).rename(columns={"plant.A[1,2]": "plant.a"})
-    files.write_table(tmp_path / "t", frame, {})
+    tables.write_table(tmp_path / "t", frame, {})
     back = read_csv(str(tmp_path / "t.csv"))
     assert back.dtype.names == tuple(frame)
     for name in frame:
@@ -85,37 +85,37 @@ def test_fmpy_reads_the_csv_exactly(tmp_path: Path):
 
 def test_nan_is_written_as_nan_and_text_as_text(tmp_path: Path):
     frame = pd.DataFrame({"name": ["j_m", None, 'a "b", c'], "true": [0.1, np.nan, np.inf]})
-    files.write_table(tmp_path / "t", frame, {})
+    tables.write_table(tmp_path / "t", frame, {})
     (tmp_path / "t.parquet").unlink()
     assert ",\n" not in (tmp_path / "t.csv").read_text()
-    back, _ = files.read_table(tmp_path / "t")
+    back, _ = tables.read_table(tmp_path / "t")
     assert list(back["name"]) == ["j_m", "", 'a "b", c']
     np.testing.assert_array_equal(back["true"], frame["true"])
 
 
 def test_all_nan_column_stays_a_column_of_numbers(tmp_path: Path):
-    files.write_table(tmp_path / "t", pd.DataFrame({"a": [np.nan, np.nan]}), {})
+    tables.write_table(tmp_path / "t", pd.DataFrame({"a": [np.nan, np.nan]}), {})
     (tmp_path / "t.parquet").unlink()
-    back, _ = files.read_table(tmp_path / "t")
+    back, _ = tables.read_table(tmp_path / "t")
     assert back["a"].dtype == float
     assert back["a"].isna().all()
 
 
 def test_parquet_fields_carry_units_and_are_compressed(tmp_path: Path):
-    files.write_table(tmp_path / "t", frame_of(AWKWARD), {"time": "s"})
+    tables.write_table(tmp_path / "t", frame_of(AWKWARD), {"time": "s"})
     meta = pq.ParquetFile(tmp_path / "t.parquet")
     assert meta.schema_arrow.field("time").metadata[b"unit"] == b"s"
     assert meta.metadata.row_group(0).column(0).compression == "ZSTD"
 
 
 def test_dot_in_the_stem_is_no_suffix(tmp_path: Path):
-    files.write_table(tmp_path / "run.v1", frame_of([1.0]), {})
+    tables.write_table(tmp_path / "run.v1", frame_of([1.0]), {})
     assert sorted(f.name for f in tmp_path.iterdir()) == ["run.v1.csv", "run.v1.meta.json", "run.v1.parquet"]
 
 
 def test_missing_table_is_said_with_its_path(tmp_path: Path):
     with pytest.raises(DataError, match=r"nothing: found neither nothing\.parquet nor nothing\.csv"):
-        files.read_table(tmp_path / "nothing")
+        tables.read_table(tmp_path / "nothing")
 
 
 @pytest.mark.parametrize(
@@ -125,14 +125,14 @@ def test_missing_table_is_said_with_its_path(tmp_path: Path):
 def test_damaged_table_is_a_data_error(tmp_path: Path, suffix: str, content: bytes):
     (tmp_path / f"t{suffix}").write_bytes(content)
     with pytest.raises(DataError, match=rf"t\{suffix}: cannot be read as a table \(.*\); make it again"):
-        files.read_table(tmp_path / "t")
+        tables.read_table(tmp_path / "t")
 
 
 def test_damaged_units_are_a_data_error(tmp_path: Path):
     (tmp_path / "t.csv").write_text("a\n1\n")
     (tmp_path / "t.meta.json").write_text("[]")
     with pytest.raises(DataError, match="cannot be read as a table"):
-        files.read_table(tmp_path / "t")
+        tables.read_table(tmp_path / "t")
 
 
 # ── JSON and text ────────────────────────────────────────────────────────────────────────────────────────
@@ -212,7 +212,7 @@ def test_stand_in_lies_beside_and_keeps_the_suffix(tmp_path: Path):
 def test_disk_failure_names_file_cause_and_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, advice: str
 ):
-    files.write_table(tmp_path / "t", frame_of([1.0]), {})
+    tables.write_table(tmp_path / "t", frame_of([1.0]), {})
     before = {f.name: f.read_bytes() for f in tmp_path.iterdir()}
 
     def refuse(descriptor: int) -> None:
@@ -220,7 +220,7 @@ def test_disk_failure_names_file_cause_and_remedy(
 
     monkeypatch.setattr(files.os, "fsync", refuse)
     with pytest.raises(StorageError) as caught:
-        files.write_table(tmp_path / "t", frame_of([2.0]), {})
+        tables.write_table(tmp_path / "t", frame_of([2.0]), {})
     assert str(caught.value).startswith(f"{tmp_path / 't.'}")
     assert f"({os.strerror(code)}); {advice}" in str(caught.value)
     assert caught.value.exit_code == 2
@@ -251,10 +251,10 @@ def test_stand_in_that_cannot_be_removed_hides_no_error(tmp_path: Path, monkeypa
 
 
 def test_full_disk_keeps_the_old_table_whole(tiny_disk: Path):
-    files.write_table(tiny_disk / "t", frame_of([1.0]), {"time": "s"})
+    tables.write_table(tiny_disk / "t", frame_of([1.0]), {"time": "s"})
     before = {f.name: f.read_bytes() for f in tiny_disk.iterdir()}
     with pytest.raises(StorageError, match=r"t\.csv: could not be written \(No space left on device\); free"):
-        files.write_table(tiny_disk / "t", frame_of([1 / 3] * 100_000), {})
+        tables.write_table(tiny_disk / "t", frame_of([1 / 3] * 100_000), {})
     assert {f.name: f.read_bytes() for f in tiny_disk.iterdir()} == before
 
 

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from results_helpers import make_run, trajectories, write_learning, write_trajectories
 
-from exlinn_fmi.data.files import write_table
+from exlinn_fmi.data.tables import write_table
 from exlinn_fmi.results import figures
 from exlinn_fmi.results.charts import charts
 from exlinn_fmi.results.figures import draw, write_figures

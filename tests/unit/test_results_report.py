@@ -23,7 +23,8 @@ from results_helpers import (
     write_trajectories,
 )
 
-from exlinn_fmi.data.files import read_json, write_json, write_table
+from exlinn_fmi.data.files import read_json, write_json
+from exlinn_fmi.data.tables import write_table
 from exlinn_fmi.results.interactive import packed
 from exlinn_fmi.results.metrics import control_metrics
 from exlinn_fmi.results.report import write_report

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from results_helpers import evaluation, make_run, write_learning, write_trajectories
 
-from exlinn_fmi.data.files import write_table
+from exlinn_fmi.data.tables import write_table
 from exlinn_fmi.errors import DataError, ScenarioError
 from exlinn_fmi.results import tables
 from exlinn_fmi.results.tables import Table, provenance, read_run, write_provenance
